@@ -1,7 +1,6 @@
 """Set-up of all tests: rank promotion is refused; shapes and types of the packages are checked."""
 
 import itertools
-import os
 from pathlib import Path
 
 import equinox as eqx
@@ -9,17 +8,11 @@ import jax
 import pytest
 from jaxtyping import install_import_hook
 
+from tests import quick_compilation
 from tests.long_examples import LONG_EXAMPLES
 
-# Most of the time of the tests is compilation, which takes far longer than execution here: leave machine code
-# as it is but for the package's own programs (see below), compile on one thread, as most programs are small,
-# and leave out, in the XLA of JAX 0.10, its newer and slower generator of kernels. With XLA_FLAGS set, if
-# only to an empty text, tests run the code that users run. XLA reads it when JAX is first used.
-QUICK_COMPILATION = "--xla_backend_optimization_level=0 --xla_cpu_parallel_codegen_split_count=1"
-if jax.__version__.startswith("0.10."):
-    QUICK_COMPILATION += " --xla_cpu_use_fusion_emitters=false"
-# Workers of pytest-xdist have it from the process that started them.
-IS_QUICK = os.environ.setdefault("XLA_FLAGS", QUICK_COMPILATION) == QUICK_COMPILATION
+# With XLA_FLAGS set, if only to an empty text, tests run the code that users run.
+quick_compilation.set_flags()
 
 jax.config.update("jax_numpy_rank_promotion", "raise")
 
@@ -29,11 +22,8 @@ CHECKER = "beartype.beartype(conf=beartype.BeartypeConf(is_pep484_tower=True))"
 with install_import_hook(["jaxlidar", "inversion"], CHECKER):
     import inversion  # noqa: F401
     import jaxlidar  # noqa: F401
-    from jaxlidar._threads import ONE_CORE
 
-if IS_QUICK:
-    # Long traces would take three times as long without any optimisation.
-    ONE_CORE["compiler_options"]["xla_backend_optimization_level"] = 1
+quick_compilation.optimise_programs()
 
 SHARED = Path(__file__).resolve().parents[2] / "shared" / "data"
 

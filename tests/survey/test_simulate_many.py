@@ -19,6 +19,7 @@ import jaxlidar as jl
 from jaxlidar.sampling.adaptive import StopReason
 from jaxlidar.survey import coverage
 from jaxlidar.survey.coverage import ground_heights, off_map
+from tests.quick_compilation import optimise_programs
 
 KEY = jax.random.key(5)
 
@@ -278,11 +279,14 @@ def die_once(marker, function, unit):
     return function(unit)
 
 
+SPAWN = multiprocessing.get_context("spawn")
+
+
 class PoolWithKilledWorker(concurrent.futures.ProcessPoolExecutor):
     """A process pool of two workers, one of which makes the file `marker` and is killed."""
 
     def __init__(self, marker):
-        super().__init__(2, mp_context=multiprocessing.get_context("spawn"))
+        super().__init__(2, SPAWN, optimise_programs)
         self.marker = marker
 
     def submit(self, function, /, *args, **kwargs):
@@ -293,7 +297,7 @@ class PoolWithKilledWorker(concurrent.futures.ProcessPoolExecutor):
 def test_a_process_pool_traces_the_same_and_may_lose_a_worker(tmp_path):
     survey, scene = nadir(32), stand()
     waveforms = jl.simulate_many(survey, scene, key=KEY, **FAST)
-    with concurrent.futures.ProcessPoolExecutor(2, mp_context=multiprocessing.get_context("spawn")) as pool:
+    with concurrent.futures.ProcessPoolExecutor(2, SPAWN, optimise_programs) as pool:
         assert same(waveforms, jl.simulate_many(survey, scene, key=KEY, **FAST, executor=pool))
     with PoolWithKilledWorker(str(tmp_path / "died")) as pool, pytest.warns(jl.LostWorkersWarning):
         assert same(waveforms, jl.simulate_many(survey, scene, key=KEY, **FAST, executor=pool))
@@ -351,6 +355,9 @@ def test_one_run_at_a_time_writes_a_file(tmp_path):
 # Another process runs this: it says that the first task is done, and waits.
 BUSY_RUN = """
 import sys, jax, jaxlidar as jl
+from tests.quick_compilation import optimise_programs
+
+optimise_programs()
 
 def wait(progress):
     print(progress.done, flush=True)

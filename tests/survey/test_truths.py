@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import jaxlidar as jl
+from tests.quick_compilation import optimise_programs
 from tests.survey.test_simulate_many import stored_tasks
 
 h5py = pytest.importorskip("h5py")
@@ -152,5 +153,5 @@ def test_shared_illumination_has_the_same_truth(tmp_path):
 @pytest.mark.slow
 def test_workers_find_the_same_truth(waveforms):
     context = multiprocessing.get_context("spawn")
-    with concurrent.futures.ProcessPoolExecutor(2, mp_context=context) as pool:
+    with concurrent.futures.ProcessPoolExecutor(2, context, optimise_programs) as pool:
         assert same(jl.simulate_many(OBLIQUE, SCENE, **OPTIONS, executor=pool), waveforms)

@@ -151,10 +151,9 @@ def test_henyey_greenstein_scattering(g):
         assert abs(value - discrete_ordinates(wrong ** np.arange(64), 0.9, 1.0, 0.2)) > 5 * bound
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("reflectance", "transmittance", "tau", "ground"),
-    [(0.4, 0.3, 1.0, 0.2), (0.1, 0.6, 2.0, 0.3)],
+    [(0.4, 0.3, 1.0, 0.2), pytest.param(0.1, 0.6, 2.0, 0.3, marks=pytest.mark.slow)],
 )
 def test_bi_lambertian_leaves(reflectance, transmittance, tau, ground):
     leaf = jl.LeafOptics(reflectance=reflectance, transmittance=transmittance)
