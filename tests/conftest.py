@@ -20,10 +20,11 @@ jax.config.update("jax_numpy_rank_promotion", "raise")
 CHECKER = "beartype.beartype(conf=beartype.BeartypeConf(is_pep484_tower=True))"
 
 with install_import_hook(["jaxlidar", "inversion"], CHECKER):
-    import inversion  # noqa: F401
     import jaxlidar  # noqa: F401
 
-quick_compilation.optimise_programs()
+    # Before `inversion` is imported, as in the processes that tests start: options are read there by then.
+    quick_compilation.optimise_programs()
+    import inversion  # noqa: F401
 
 SHARED = Path(__file__).resolve().parents[2] / "shared" / "data"
 

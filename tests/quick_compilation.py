@@ -1,8 +1,8 @@
 """Options with which the tests compile, where most of their time goes; also for processes that tests start.
 
-Machine code is left as it is but for the package's own programs: long traces would take three times as long.
-Most programs are small: they compile on one thread. In the XLA of JAX 0.10, its newer and slower generator of
-kernels is left out.
+Machine code is not optimised, except a little that of the package's own programs: long traces would take
+three times as long. Most programs are small: they compile on one thread. In the XLA of JAX 0.10, its newer
+and slower generator of kernels is left out.
 """
 
 import os
@@ -20,7 +20,7 @@ def set_flags() -> None:
 
 
 def optimise_programs() -> None:
-    """Have the package's own programs optimised a little, where nothing else is."""
+    """Have the package's own programs optimised a little, if XLA_FLAGS has the options of the tests."""
     from jaxlidar.extend import ONE_CORE
 
     if os.environ.get("XLA_FLAGS") == FLAGS:
