@@ -1,7 +1,11 @@
 """Products of arrays ask for full precision: by default, GPUs round their factors to 11 bits.
 
-The programs of simulations, leaves and their derivatives are searched for products that do not ask for it.
+The programs of simulations, leaves and their derivatives are searched for products that do not ask for it,
+and the sources for JAX's own functions. (Of the operator `@`, sources do not tell whether it is NumPy's.)
 """
+
+import ast
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -81,6 +85,33 @@ def test_leaves():
 
 def test_the_window_of_the_first_return():
     assert not rounded_products(lambda e: first_return_window(np.arange(40.0), e, 4.0), jnp.ones((1, 40)))
+
+
+PRODUCTS = ("dot", "einsum", "inner", "matmul", "tensordot", "vdot")
+SOURCES = [
+    path
+    for package in ("jaxlidar", "inversion")
+    for path in (Path(__file__).resolve().parents[2] / package).rglob("*.py")
+    if path.name != "_products.py"
+]
+
+
+def default_products(source):
+    """Return the products of `jax.numpy` that a source calls or names, which have the default precision."""
+    return [
+        f"line {node.lineno}: jnp.{node.attr}"
+        for node in ast.walk(ast.parse(source))
+        if isinstance(node, ast.Attribute)
+        and node.attr in PRODUCTS
+        and isinstance(node.value, ast.Name)
+        and node.value.id == "jnp"
+    ]
+
+
+def test_sources_have_no_products_of_jax_numpy():
+    assert len(SOURCES) > 100
+    assert not {str(path): found for path in SOURCES if (found := default_products(path.read_text()))}
+    assert default_products("y = jnp.einsum('ij,j->i', a, x)")
 
 
 def test_a_product_of_default_precision_is_found():
