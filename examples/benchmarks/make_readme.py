@@ -425,13 +425,19 @@ def meshes(record: dict) -> str:
 
 
 def devices(record: dict) -> str:
-    def rows(kind: str, key: str) -> list[list[str]]:
+    def rows(kind: str) -> list[list[str]]:
         """Return a row for each number of traces, with a column for each device and order."""
         parts = [part["side by side"][kind] for part in record.values()]
         columns = [{r["traces"]: r for r in records} for part in parts for records in part.values()]
         counts = sorted({count for column in columns for count in column})
         return [
-            [f"{count:,}", *(number(column[count][key]) if count in column else "" for column in columns)]
+            [
+                f"{count:,}",
+                *(
+                    number(column[count]["photons per second"]) if count in column else ""
+                    for column in columns
+                ),
+            ]
             for count in counts
         ]
 
@@ -462,14 +468,12 @@ def devices(record: dict) -> str:
         "precision there as well. What a GPU gains depends on how much light is traced at once. The table "
         "has photons per second of traces side by side: independent keys of one crown of 64³ voxels under "
         "`jax.vmap`, with 256 photons and 256 rays each. (The times of the H200 are from before products "
-        "asked for full precision; they are a small part of a trace.)",
-        table(head("values"), rows("values", "photons per second")),
+        "asked for full precision.)",
+        table(head("values"), rows("values")),
         "The same for gradients in every voxel, by reverse mode:",
-        table(head("gradient"), rows("gradient", "photons per second")),
-        "A single simulation or shot is too small for a GPU: photons march in chunks that fit a processor's "
-        "cache, one chunk after the other, and each step is several kernels whose launches take longer than "
-        "their work. Batches of keys, scenes or shots under `jax.vmap` are the way to use one; PROSPECT is "
-        "one batch anyway.",
+        table(head("gradient"), rows("gradient")),
+        "A single simulation or shot is too small for a GPU: its photons march in chunks that fit a "
+        "processor's cache, one chunk after the other. Traces side by side, and leaves, gain:",
         table(["one call", *record], calls),
     )
 
