@@ -108,11 +108,11 @@ def draw(results: dict, out) -> None:
     figure, axes = new_figure(2, size=(9, 4))
     for panel, kind in zip(axes, ("values", "gradient")):
         for device, record in results.items():
-            for (name, rows), style in zip(record["side by side"][kind].items(), ("o-", "s--")):
+            for name, rows in record["side by side"][kind].items():
                 panel.loglog(
                     [r["traces"] for r in rows],
                     [r["photons per second"] for r in rows],
-                    style,
+                    "o-",
                     label=f"{device}, {name}",
                 )
         panel.set(xlabel="traces side by side", ylabel="photons per second", title=kind)

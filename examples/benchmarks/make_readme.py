@@ -428,18 +428,13 @@ def devices(record: dict) -> str:
     def rows(kind: str) -> list[list[str]]:
         """Return a row for each number of traces, with a column for each device and order."""
         parts = [part["side by side"][kind] for part in record.values()]
-        columns = [{r["traces"]: r for r in records} for part in parts for records in part.values()]
-        counts = sorted({count for column in columns for count in column})
-        return [
-            [
-                f"{count:,}",
-                *(
-                    number(column[count]["photons per second"]) if count in column else ""
-                    for column in columns
-                ),
-            ]
-            for count in counts
+        columns = [
+            {r["traces"]: number(r["photons per second"]) for r in records}
+            for part in parts
+            for records in part.values()
         ]
+        counts = sorted({count for column in columns for count in column})
+        return [[f"{count:,}", *(column.get(count, "") for column in columns)] for count in counts]
 
     def head(kind: str) -> list[str]:
         names = [f"{name}, {n}" for name, part in record.items() for n in part["side by side"][kind]]
