@@ -362,13 +362,13 @@ def draw_record(record: dict, path) -> None:
 def main() -> None:
     arguments = options("Cost of accuracy.", batches=64, photons=2048)
     all_cases = cases()
-    record = {"machine": machine(), "targets": TARGETS, "scenes": {}, "knobs": deterministic(all_cases)}
+    record = {"targets": TARGETS, "scenes": {}, "knobs": deterministic(all_cases)}
     for name, case in all_cases.items():
         if case.orders == 1:
             record["scenes"][name] = ground_times(case, arguments.photons)
         else:
             record["scenes"][name] = random_knobs(name, case, arguments.batches, arguments.photons)
-    write_json(arguments.out / "accuracy_cost.json", record)
+    write_json(arguments.out / "accuracy_cost.json", {"machine": machine(), **record})
     draw_record(record, arguments.out / "accuracy_cost.png")
 
     def cell(pair):

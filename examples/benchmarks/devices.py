@@ -128,7 +128,7 @@ def main() -> None:
     rounds = arguments.rounds
     counts = [n for n in (1, 8, 64, 256, 1024, 4096) if n <= arguments.traces]
     few = [n for n in counts if n <= 256]
-    record = {"machine": machine()}
+    record = {}
     device = jax.devices()[0]
     name = f"{os.cpu_count()} CPU cores" if device.platform == "cpu" else device.device_kind
     record["leaves"] = [leaf_spectra(n, rounds) for n in (1000, 10000)]
@@ -142,7 +142,7 @@ def main() -> None:
     print(record["simulate"], flush=True)
     record["survey"] = survey(1000, 1)
     print(record["survey"], flush=True)
-    results[name] = record
+    results[name] = {"machine": machine(), **record}
     write_json(path, results)
     draw(results, arguments.out)
     rows = [

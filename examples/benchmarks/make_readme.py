@@ -36,7 +36,10 @@ def machine(record: dict) -> str:
     if "machine" not in record:
         return " ".join(machine(part) for part in record.values())
     m = record["machine"]
-    return f"Measured on {m['cores']} cores ({m['processor']}), Python {m['python']}, jax {m['jax']}."
+    text = f"Measured on {m['cores']} cores ({m['processor']}), Python {m['python']}, jax {m['jax']}."
+    if "system share" in m:
+        text += f" Of {m['CPU seconds']:.0f} CPU seconds the operating system took {m['system share']:.0%}."
+    return text
 
 
 def accuracy(record: dict) -> str:
