@@ -78,7 +78,8 @@ class FitSummary:
     - `values`, `stderr`: estimates and standard errors; infinite errors for unknowns that neither
       data nor priors constrain to within their bounds.
     - `robust_stderr`: standard errors widened by misfit and by the spread over several starts.
-    - `prior_share`: share of the prior in each estimate, one less the diagonal of the averaging kernel.
+    - `prior_share`: share of the prior in each estimate, one less the diagonal of the averaging kernel
+      without bounds.
     - `at_bound`: True for unknowns at one of their bounds.
     - `covariance`: of the estimates.
     - `averaging`: averaging kernel, d estimate / d truth.

@@ -8,9 +8,9 @@ Jacobian J and prior precision P. The credible band is cut at the bounds. The av
 
     A = d estimate / d truth = (J^T J + P)^-1 J^T J
 
-is the identity for unknowns that the data determine fully, and zero for those they do not constrain. It is
-that of the posterior without bounds. Its trace is the number of degrees of freedom for signal: how many
-numbers the data determine.
+is the identity for unknowns that the data determine fully, and zero for those they do not constrain. An
+estimate at a bound is held there: its row is zero, and J and P are those of the others. The trace is the
+number of degrees of freedom for signal: how many numbers the data determine.
 
 **Source:** Rodgers (2000), Inverse Methods for Atmospheric Sounding, chapters 2 and 3; resolution as spacing
 over diagonal: Purser and Huang (1993), J. Appl. Meteorol. 32, 1211.
@@ -120,10 +120,11 @@ class AveragingKernel(NamedTuple):
     """Response of the estimate of a profile to the true profile.
 
     - `matrix`: (..., layers, layers) derivatives of the estimated values (rows) in the true ones (columns).
+      Rows of layers at one of their bounds are zero: a small change of the truth leaves them there.
     - `degrees_of_freedom`: (...) degrees of freedom for signal, the number of independent numbers that the
       data determine: the trace.
     - `resolution`: (..., layers) height per number that the data determine, in the unit of the spacing:
-      spacing over diagonal; infinite for layers that the data do not constrain.
+      spacing over diagonal; infinite for layers that the data do not constrain, and for those at a bound.
 
     **Example:** a diagonal of one half: two layers for each number from the data.
 

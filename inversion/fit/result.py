@@ -35,7 +35,7 @@ class Retrieval(AbstractPosterior):
       never narrower. Use it for recorded waveforms, which no model fits to within the noise: see
       `inversion.fit.uncertainty`.
     - `prior_share`: share of the prior in each estimate, 0 to 1: one less the diagonal of the averaging
-      kernel.
+      kernel without bounds.
     - `at_bound`: True for unknowns at one of their bounds.
     - `simulation_error`: the part of `stderr` that comes from the simulation's own noise; it falls with
       `n_photons`.

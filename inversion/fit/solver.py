@@ -564,9 +564,9 @@ class LeastSquaresFit:
         """Return the result at an iterate.
 
         1. Whiten Jacobian and deviations of the batches by the present weights.
-        2. Compute the covariance of the estimates, and the errors widened by misfit.
-        3. Find unknowns at a bound, and reduced chi-squared.
-        4. Compute the cost by which fits from several starts are compared.
+        2. Find unknowns at a bound.
+        3. Compute the covariance of the estimates, and the errors widened by misfit.
+        4. Compute reduced chi-squared, and the cost by which fits from several starts are compared.
         """
         is_fitted, evaluation = self.is_fitted, iterate.evaluation
         deviations = self._deviations(iterate)
@@ -576,6 +576,8 @@ class LeastSquaresFit:
         measured_sigma = self.observed.sigma[is_fitted]
         prior_residual, prior_jacobian = self.prior(iterate.values)
         precision = prior_jacobian.T @ prior_jacobian
+        fraction = (iterate.values - self.low) / self.width
+        at_low, at_high = fraction < _AT_BOUND, fraction > 1 - _AT_BOUND
         estimate = estimate_covariance(
             jacobian,
             precision,
@@ -583,13 +585,12 @@ class LeastSquaresFit:
             (measured_sigma / self.noise.sigma_unshared) ** 2,
             None if deviations is None else self.noise.whiten(deviations.T).T,
             self.prior.basis,
+            at_low | at_high,
         )
         stderr = np.sqrt(np.diag(estimate.covariance))
         robust_stderr, independent_samples = self._robust_stderr(
             iterate, stderr, estimate, jacobian, precision
         )
-        fraction = (iterate.values - self.low) / self.width
-        at_low, at_high = fraction < _AT_BOUND, fraction > 1 - _AT_BOUND
         residuals = np.zeros(is_fitted.shape)
         residuals[is_fitted] = -self.noise.whiten(iterate.difference)
         n_undetermined = int(np.sum(estimate.is_undetermined))

@@ -19,6 +19,15 @@ W alone would miss.
 in an estimate is 1 - A_ii, the diagonal of H^-1 P, cut to [0, 1], which it may leave if unknowns are
 correlated.
 
+**Unknowns at their bounds.** An estimate at its bound stays there when the truth changes a little, and the
+others are then fitted with it held. With F the free unknowns and B those at a bound, the averaging kernel is
+
+    A_F = (H_FF)^-1 (J^T J)_F,    A_B = 0,
+
+so that unknowns at their bounds have no degrees of freedom for signal. (H_FF)^-1 is the covariance of the
+free unknowns at known ones, S_FF - S_FB S_BB^-1 S_BF with S = H^-1. Shares of the prior and standard errors
+are those without bounds: an estimate at its bound has an error.
+
 **Undetermined unknowns.** An unknown is undetermined if its standard error, from data and priors, exceeds the
 width of its bounds, alone or in combination with others: eigenvectors of H, scaled to a unit diagonal, whose
 eigenvalue is rounding.
@@ -49,7 +58,7 @@ Newton decrement: Boyd and Vandenberghe (2004), Convex Optimization, section 9.5
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 # Smallest eigenvalue of H, scaled to a unit diagonal, at which a combination of unknowns counts as
 # determined.
@@ -76,7 +85,7 @@ class EstimateCovariance(NamedTuple):
     - `is_undetermined`: True for unknowns that neither data nor priors constrain to within their bounds.
     - `inverse_information`: H^-1; zero for undetermined combinations.
     - `prior_share`: 1 - A_ii, cut to [0, 1]: from 0 (all from the data) to 1 (all from the prior).
-    - `averaging`: A = H^-1 J^T J.
+    - `averaging`: A, with unknowns at their bounds held there.
     """
 
     covariance: Float[np.ndarray, "n n"]
@@ -94,6 +103,7 @@ def estimate_covariance(
     measurement_fraction: Float[np.ndarray, " data"],
     deviations: Float[np.ndarray, "batches data"] | None,
     basis: Float[np.ndarray, "n n"] | None = None,
+    at_bound: Bool[np.ndarray, " n"] | None = None,
 ) -> EstimateCovariance:
     """Return the covariance at the solution.
 
@@ -114,6 +124,7 @@ def estimate_covariance(
     - `deviations`: of each batch from their mean, whitened, or None.
     - `basis`: columns in which a prior that correlates unknowns is the identity; such a prior's P alone is
       too ill-conditioned to invert. Default None: no such prior.
+    - `at_bound`: True for unknowns at one of their bounds. Default None: none is.
     """
     n = width.size
     basis = np.eye(n) if basis is None else basis
@@ -166,8 +177,24 @@ def estimate_covariance(
         is_undetermined,
         inverse,
         np.clip(prior_share, 0.0, 1.0),
-        inverse @ data_information,
+        _covariance_at_bounds(inverse, at_bound) @ data_information,
     )
+
+
+def _covariance_at_bounds(
+    inverse: Float[np.ndarray, "n n"], at_bound: Bool[np.ndarray, " n"] | None
+) -> Float[np.ndarray, "n n"]:
+    """Return the covariance with the unknowns at a bound known: their rows and columns are zero."""
+    if at_bound is None or not np.any(at_bound):
+        return inverse
+    held = np.flatnonzero(at_bound)
+    # Rows of undetermined unknowns are zero already, which makes the block singular.
+    gain = inverse[:, held] @ np.linalg.pinv(inverse[np.ix_(held, held)], hermitian=True)
+    conditional = inverse - gain @ inverse[held]
+    # Zero but for rounding.
+    conditional[held] = 0.0
+    conditional[:, held] = 0.0
+    return conditional
 
 
 def correlation_of(covariance: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"]:

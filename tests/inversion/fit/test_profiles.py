@@ -157,6 +157,29 @@ def test_the_averaging_kernel_is_that_of_refits():
     np.testing.assert_allclose(kernel.resolution, np.where(diagonal > 0, 1.5 / diagonal, np.inf))
 
 
+def test_layers_at_their_bound_have_no_degrees_of_freedom():
+    """Against refits of a changed truth, within the bounds."""
+    truth = np.append(9.0 * np.sin(np.arange(LAYERS)), 2.0)
+    record = instrument() @ truth + np.random.default_rng(5).normal(size=SAMPLES)
+    smooth, change = Smooth(2.0, strength=5.0, mean=0.5), 0.02
+    fit = fitted(record, smooth, low=0.0)
+    is_held = fit.values["x"] < 5e-3
+    assert 2 <= is_held.sum() < LAYERS - 2
+    kernel = fit.averaging_kernel("x")
+    for layer in (1, int(np.argmax(is_held)), LAYERS - 2):
+        ends = [record + sign * change * instrument()[:, layer] for sign in (1.0, -1.0)]
+        refits = [fitted(end, smooth, low=0.0).values["x"] for end in ends]
+        np.testing.assert_allclose(
+            (refits[0] - refits[1]) / (2.0 * change), kernel.matrix[:, layer], atol=0.03
+        )
+    assert np.all(kernel.matrix[is_held] == 0.0)
+    assert np.all(np.isinf(kernel.resolution[is_held]))
+    free_layers = LAYERS - is_held.sum()
+    assert 1.0 < kernel.degrees_of_freedom < free_layers
+    # Negative control: the kernel of the fit without bounds counts more.
+    assert fitted(record, smooth).averaging_kernel("x").degrees_of_freedom > kernel.degrees_of_freedom + 1.0
+
+
 def coverage(strength, count, level=0.9):
     """Return the z-score of the coverage of bands with this strength, of profiles of strength STRENGTH."""
     random = np.random.default_rng(7)
