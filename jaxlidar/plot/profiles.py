@@ -59,9 +59,9 @@ def profile(
     """
     edges, values = _layers("", (height, density))
     profiles = {}
-    for name, given in (("truth", truth), ("product", product)):
-        if given is not None:
-            profiles[name] = _layers(name, given, edges)
+    for name, layers in (("truth", truth), ("product", product)):
+        if layers is not None:
+            profiles[name] = _layers(name, layers, edges)
     ax = make_axes(ax, _PROFILE_SIZE)
     colours = {"truth": TOTAL_COLOUR, "product": _PRODUCT_COLOUR}
     for name, (layer_edges, layer_density) in profiles.items():
