@@ -87,11 +87,14 @@ def count_comment_and_code_lines(text: str) -> tuple[int, int]:
         tokenize.ENDMARKER,
         tokenize.STRING,
     }
-    comments, code_lines = 0, set()
+    # From Python 3.12 on, a formatted string is a run of tokens, strings in its fields among them.
+    start_type, end_type = getattr(tokenize, "FSTRING_START", None), getattr(tokenize, "FSTRING_END", None)
+    comments, code_lines, string_depth = 0, set(), 0
     for token in tokenize.generate_tokens(io.StringIO(text).readline):
+        string_depth += (token.type == start_type) - (token.type == end_type)
         if token.type == tokenize.COMMENT:
             comments += token.line.lstrip().startswith("#")
-        elif token.type not in no_code:
+        elif token.type not in no_code and token.type != end_type and string_depth == 0:
             code_lines.add(token.start[0])
     return comments, len(code_lines)
 
@@ -191,8 +194,9 @@ def test_question_words_are_counted():
 def test_comment_lines_are_counted():
     source = (
         '"""Text.\n\n# Not a comment.\n"""\n# A comment.\nx = (\n    1  # beside code\n)\n\n    # Another.\n'
+        'y = (\n    f"{x}"\n)\n'
     )
-    assert count_comment_and_code_lines(source) == (2, 3)
+    assert count_comment_and_code_lines(source) == (2, 5)
 
 
 def test_class_names_are_counted(tmp_path):
