@@ -104,6 +104,40 @@ class Stand(Sequence[Tree]):
         for name, value in zip(self.__dataclass_fields__, values):
             object.__setattr__(self, name, value)
 
+    @staticmethod
+    def joined(stands: "Sequence[Stand | Tree]") -> "Stand":
+        """Join several stands, and single trees, which stay where they are.
+
+        **Arguments:**
+
+        - `stands`: any number of `Stand` or `Tree`, at least one.
+
+        **Returns:** a `Stand`.
+
+        **Raises:** ValueError where there is none, and for stands of which some have leaf areas and some not;
+        TypeError for an object of another kind.
+        """
+        check_kind("stands", stands, Sequence, "several Stand, as in [stand, other]")
+        for stand in stands:
+            check_kind("one of stands", stand, Stand | Tree, "a Stand or a Tree")
+        if not len(stands):
+            raise ValueError("stands is empty; at least one stand is admissible")
+        alike = [s if isinstance(s, Stand) else Stand(s, s.base[None]) for s in stands]
+        areas = [stand.leaf_area for stand in alike if stand.leaf_area is not None]
+        if areas and len(areas) < len(alike):
+            raise ValueError(
+                f"stands: {len(areas)} of {len(alike)} have leaf areas; admissible is all or none"
+            )
+        first = np.cumsum([0, *(len(stand.individuals) for stand in alike)])
+        return Stand(
+            [tree for stand in alike for tree in stand.individuals],
+            np.concatenate([stand.position for stand in alike]),
+            np.concatenate([stand.individual + i for stand, i in zip(alike, first)]),
+            np.concatenate([stand.azimuth for stand in alike]),
+            np.concatenate([stand.scale for stand in alike]),
+            np.concatenate(areas) if areas else None,
+        )
+
     def __len__(self) -> int:
         return len(self.position)
 

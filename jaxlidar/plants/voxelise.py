@@ -276,7 +276,7 @@ def _voxelise_stand(
     azimuths = check_integer("azimuths", azimuths)
     step = np.round(stand.azimuth / 360.0 * azimuths).astype(int) % azimuths
     material = np.array([_has_material(tree) for tree in stand.individuals])[stand.individual]
-    has_wood, has_leaf = (bool(present) for present in material.any(axis=0))
+    has_wood, has_leaf = bool(np.any(material[:, 0])), bool(np.any(material[:, 1]))
     if not has_wood and not has_leaf:
         raise ValueError("individuals have neither wood nor clumps; there is nothing to voxelise")
     patterns: dict[tuple[int, int], list[int]] = {}
