@@ -836,6 +836,19 @@ ENTRY_POINTS: dict[str, Callable[[], EntryPoint]] = {
         {"pulses": RECORDED_PULSE, "echoes": POWER, "noise": np.full(60, 0.01), "before": 2, "after": 4}
         | {"interleaved": 1},
     ),
+    "inversion.shot_response": lambda: EntryPoint(
+        lambda signal, noise_std, pulse_time, pulse_power, fraction: inversion.shot_response(
+            [
+                types.SimpleNamespace(
+                    signal=signal, noise_std=noise_std, pulse_time=pulse_time, pulse_power=pulse_power
+                )
+            ]
+            * 3,
+            fraction=fraction,
+        ),
+        {"signal": np.exp(-0.5 * ((np.arange(300.0) - 100.0) / 7.0) ** 2), "noise_std": 0.01}
+        | {"pulse_time": np.arange(21.0) - 10.0, "pulse_power": RECORDED_PULSE, "fraction": 0.5},
+    ),
     "inversion.recorded_pulse": lambda: EntryPoint(
         inversion.recorded_pulse, {"time": np.arange(21.0), "power": RECORDED_PULSE, "finer": 4}
     ),

@@ -128,6 +128,7 @@ RESULTS = (
     *("io.ColumnAxis", "io.Column", "io.ShotTable", "io.PhotonImpulse", "io.PhotonTrack"),
     *("inversion.TableProgress", "inversion.Comparison", "inversion.ComparisonStatistics"),
     *("inversion.ComparedColumn", "inversion.SceneRetrieval", "inversion.SceneStep"),
+    "inversion.ShotResponse",
 )
 OF_OBJECTS = (
     *("instrument", "instruments", "instrument_sources", "compilation_cache", "simulate_scenes"),
