@@ -21,7 +21,7 @@ from jaxlidar.plot.style import (
     TOTAL_COLOUR,
     label_map,
     make_axes,
-    material_colour,
+    material_colours,
 )
 from jaxlidar.scenes.scene import Scene
 from jaxlidar.scenes.terrain import Terrain
@@ -270,7 +270,9 @@ def _groups_of(returns: DiscreteReturns | PointCloud, colour_by: str) -> list[tu
             "colour_by = 'material' of a PointCloud, which has no materials; admissible are 'class' and "
             "'height'"
         )
-    return [(name, material_colour(name)) for name in returns.material.tolist()]
+    names = returns.material.tolist()
+    colours = material_colours(names)
+    return [(name, colours[name]) for name in names]
 
 
 def _ground_heights(scene: Scene, points: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, " n"]:

@@ -3,7 +3,8 @@
 Colours are those of Okabe and Ito (2008), which are distinct with any colour vision.
 """
 
-from collections.abc import Sequence
+import itertools
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
@@ -22,6 +23,8 @@ MATERIAL_COLOURS = {
     "plate": "#56B4E9",
     "mesh": "#CC79A7",
 }
+# Of the other materials of meshes.
+_MESH_COLOURS = ("#CC79A7", "#D55E00", "#0072B2", "#F0E442", "#56B4E9", "#000000")
 OTHER_COLOUR = "#999999"
 TOTAL_COLOUR = "#1A1A1A"
 BEAM_COLOUR = "#D55E00"
@@ -30,9 +33,22 @@ WAVELENGTH_COLOURS = ("#0072B2", "#D55E00", "#CC79A7", "#009E73", "#E69F00", "#5
 VISIBLE_FRACTION = 0.004
 
 
-def material_colour(name: str) -> str:
-    """Return the colour of a material; several plates are called "plate 1", "plate 2"."""
-    return MATERIAL_COLOURS.get(name.split()[0], OTHER_COLOUR)
+def material_colours(names: Iterable[str]) -> dict[str, str]:
+    """Return the colours of materials, by name; several plates are called "plate 1", "plate 2".
+
+    Materials of a mesh, called "mesh:NAME", are told apart: leaf, wood and bark as in voxels, others in
+    alphabetical order.
+    """
+    others = itertools.cycle(_MESH_COLOURS)
+    colours = {}
+    for name in sorted(set(names)):
+        kind = name.partition(":")[2] or name.split()[0]
+        kind = "bark" if kind == "wood" else kind
+        if kind in MATERIAL_COLOURS:
+            colours[name] = MATERIAL_COLOURS[kind]
+        else:
+            colours[name] = next(others) if name.startswith("mesh:") else OTHER_COLOUR
+    return colours
 
 
 def check_waveform(wave: Any) -> None:

@@ -25,7 +25,7 @@ from jaxlidar.plot.style import (
     check_waveform,
     limit_height,
     make_axes,
-    material_colour,
+    material_colours,
     wavelength_rows,
 )
 from jaxlidar.spectral.waveform import Waveform
@@ -125,10 +125,11 @@ def _draw_components(ax: Axes, wave: Waveform, i: int) -> None:
     height = np.asarray(wave.height)
     names = [n for n in wave.components if n not in _ORDERS]
     peaks = {n: float(np.max(np.asarray(wave.components[n][i]), initial=0.0)) for n in names}
+    colours = material_colours(names)
     for name in sorted(names, key=lambda n: -peaks[n]):
         if peaks[name] > 0:
             component = np.asarray(wave.components[name][i])
-            colour = material_colour(name)
+            colour = colours[name]
             ax.fill_betweenx(height, 0.0, component, color=colour, alpha=0.45, linewidth=0, label=name)
             ax.plot(component, height, color=colour, linewidth=0.8)
     higher = np.asarray(wave.components["higher"][i])
@@ -213,6 +214,7 @@ def waterfall(
         components = dict(sorted(stored.items(), key=lambda item: -float(item[1].max())))
     lowest, highest = np.inf, -np.inf
     drawn_materials: dict[str, str] = {}
+    colours = material_colours(components)
     # From the right: each waveform may reach over its neighbour to the right, and is drawn in front of it.
     for i in np.argsort(-places, kind="stable"):
         height = np.asarray(waves[int(rows[i])].height, float)
@@ -220,7 +222,7 @@ def waterfall(
         if visible.size == 0:
             continue
         shown = slice(max(visible[0] - 1, 0), visible[-1] + 2)
-        areas = {n: (material_colour(n), a[i, shown]) for n, a in components.items() if np.any(a[i, shown])}
+        areas = {n: (colours[n], a[i, shown]) for n, a in components.items() if np.any(a[i, shown])}
         for colour, values in areas.values() or [(OTHER_COLOUR, power[i, shown])]:
             edge = places[i] + scale * values
             ax.fill_betweenx(height[shown], places[i], edge, color=colour, alpha=0.6, linewidth=0)

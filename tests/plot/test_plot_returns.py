@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 
 import jaxlidar as jl
 from jaxlidar import plot
-from jaxlidar.plot.style import MATERIAL_COLOURS
+from jaxlidar.plot.style import MATERIAL_COLOURS, material_colours
 
 matplotlib.use("agg")
 
@@ -65,6 +65,17 @@ def test_points_from_above_have_the_colours_of_their_materials(returns, axes):
         (line,) = [line for line in axes.lines if line.get_label() == name]
         assert to_hex(line.get_color()).upper() == MATERIAL_COLOURS[name]
     assert (axes.get_xlabel(), axes.get_ylabel()) == ("x, east (m)", "y, north (m)")
+
+
+def test_materials_of_meshes_are_told_apart():
+    names = ["mesh:wall", "mesh:roof", "mesh:wire", "mesh:leaf", "mesh:wood", "ground", "mesh"]
+    colours = material_colours(names)
+    assert len({colours[name] for name in names[:-1]}) == len(names) - 1
+    assert (colours["mesh:leaf"], colours["mesh:wood"]) == (
+        MATERIAL_COLOURS["leaf"],
+        MATERIAL_COLOURS["bark"],
+    )
+    assert colours["mesh"] == MATERIAL_COLOURS["mesh"]
 
 
 def test_points_have_the_names_of_their_classes(returns, axes, tmp_path):
