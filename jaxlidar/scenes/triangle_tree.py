@@ -16,8 +16,8 @@ of the trail, the next node is the sibling of the ancestor k levels up, (n >> k)
 
 Rays meet triangles by signed areas of their edges, seen along the ray (Woop, Benthin and Wald 2013, J.
 Comput. Graph. Tech. 2(1), 65). Neighbours compute the area of a shared edge from the same numbers. An area
-counts as zero, and so as inside, within the rounding of its two products: fused multiplications, by which
-compilers make the areas of neighbours differ, then open no gap.
+counts as zero, and so as inside, within the rounding of its corners and of their products: fused
+multiplications, by which compilers make the areas of neighbours differ, then open no gap.
 
 Where the scene repeats, with the period L along x and y, the upper tree holds what lies in one cell of L x L,
 whole instances: those that cross its sides lie on both. A ray is followed from cell to cell, in each with its
@@ -49,8 +49,10 @@ _PARALLEL = 1e-15
 _NOWHERE = 1e35
 # Rays that are followed at once.
 _LANES = 128
-# Rounding of a signed area, in units of the floating-point precision and of its products.
-_AREA_ROUNDING = 4.0
+# So few rays take less time one by one: a step of all lanes takes as long as about thirty of a single ray.
+_FEW = 24
+# Rounding of a signed area, in units of the floating-point precision and of its corners' coordinates.
+_AREA_ROUNDING = 2.0
 # Relative slack of the distances at which a ray leaves a box (Ize 2013, J. Comput. Graph. Tech. 2(2), 12).
 _BOX_ROUNDING = 8.0
 # Cells of a repeating scene through which a ray is followed: so many, that only rays which are level to one
@@ -175,11 +177,11 @@ class _CellWalk(eqx.Module):
     - `count`: number of cells so far.
     """
 
-    start: tuple[Float[Array, "lanes"], Float[Array, "lanes"]]
-    cell: tuple[Int[Array, "lanes"], Int[Array, "lanes"]]
-    leave: Float[Array, "lanes"]
-    last: Float[Array, "lanes"]
-    count: Int[Array, "lanes"]
+    start: tuple[Float[Array, "*lanes"], Float[Array, "*lanes"]]
+    cell: tuple[Int[Array, "*lanes"], Int[Array, "*lanes"]]
+    leave: Float[Array, "*lanes"]
+    last: Float[Array, "*lanes"]
+    count: Int[Array, "*lanes"]
 
 
 class _TreeTraversal(eqx.Module):
@@ -195,21 +197,21 @@ class _TreeTraversal(eqx.Module):
     - `walk`: where the ray is in a scene that repeats; else None.
     """
 
-    ray: Int[Array, "lanes"]
+    ray: Int[Array, "*lanes"]
     upper_x: Vec
     upper_w: Vec
     x: Vec
     w: Vec
-    upper_node: Int[Array, "lanes"]
-    upper_trail: Int[Array, "lanes"]
-    node: Int[Array, "lanes"]
-    trail: Int[Array, "lanes"]
-    inside: Bool[Array, "lanes"]
-    active: Bool[Array, "lanes"]
+    upper_node: Int[Array, "*lanes"]
+    upper_trail: Int[Array, "*lanes"]
+    node: Int[Array, "*lanes"]
+    trail: Int[Array, "*lanes"]
+    inside: Bool[Array, "*lanes"]
+    active: Bool[Array, "*lanes"]
     instance: Instance | None
-    distance: Float[Array, "lanes"]
-    row: Int[Array, "lanes"]
-    leaf: Int[Array, "lanes"]
+    distance: Float[Array, "*lanes"]
+    row: Int[Array, "*lanes"]
+    leaf: Int[Array, "*lanes"]
     walk: _CellWalk | None
 
 
@@ -236,6 +238,7 @@ def nearest_triangle(
     1. Put the rays that meet the box around everything into a queue.
     2. Follow as many as there are lanes, until half of these are idle (`_visit_node`).
     3. Note what the finished rays have met, fill their lanes from the queue, and go on with 2.
+    4. Once the queue is empty and few rays are left, follow each of these to its end, one by one.
 
     **Arguments:** `x`, `w`: starts and directions. `active`: False for rays that need no answer.
     """
@@ -308,10 +311,7 @@ def nearest_triangle(
     def note(hit: TriangleHit, lanes: _TreeTraversal) -> TriangleHit:
         """Note what finished rays have met; idle lanes write to the spare ray."""
         number = jnp.where(lanes.active, n_rays, lanes.ray)
-        distance = jnp.where(lanes.row > 0, lanes.distance, FAR)
-        cell = None if lanes.walk is None else lanes.walk.cell
-        results = TriangleHit(distance, lanes.row, lanes.leaf, cell)
-        return jax.tree.map(lambda a, b: a.at[number].set(b), hit, results)
+        return jax.tree.map(lambda a, b: a.at[number].set(b), hit, _result(lanes))
 
     def take_turns(state: _RayQueue) -> _RayQueue:
         """Fill idle lanes from the queue, and follow rays until half of the lanes are idle."""
@@ -322,18 +322,40 @@ def nearest_triangle(
         fresh = send(jnp.where(is_sent, queue[jnp.minimum(position, n_rays - 1)], n_rays))
         lanes = jax.tree.map(lambda a, b: jnp.where(is_idle, a, b), fresh, state.lanes)
         n_sent = jnp.minimum(state.n_sent + jnp.sum(is_idle, dtype=jnp.int32), n_waiting)
-        # Nobody waits any more: follow the last ones to their ends.
-        n_idle = jnp.where(n_sent < n_waiting, n_lanes // 2, n_lanes)
+        # Nobody waits any more: follow the last ones until few are left.
+        n_idle = jnp.where(n_sent < n_waiting, n_lanes // 2, n_lanes - _FEW)
         return _RayQueue(follow(lanes, n_idle), n_sent, hit)
 
     def goes_on(state: _RayQueue) -> Bool[Array, ""]:
-        return (state.n_sent < n_waiting) | jnp.any(state.lanes.active)
+        return (state.n_sent < n_waiting) | (jnp.sum(state.lanes.active, dtype=jnp.int32) >= _FEW)
+
+    def finish(state: _RayQueue) -> TriangleHit:
+        """Follow the rays that are left to their ends, one by one, and return what all have met."""
+        lanes, hit = state.lanes, note(state.hit, state.lanes)
+        unfinished = jnp.flatnonzero(lanes.active, size=min(n_lanes, _FEW), fill_value=0)
+
+        def traverse(state: tuple[_TreeTraversal, Array]) -> tuple[Array, TriangleHit]:
+            lanes, lane = state
+            ray = jax.tree.map(lambda a: a.at[lane].get(mode="promise_in_bounds"), lanes)
+            ray = lax.while_loop(lambda s: s.active, lambda s: _visit_node(tree, s, any_hit, precision), ray)
+            return ray.ray, _result(ray)
+
+        def one_lane(n: Array, hit: TriangleHit) -> TriangleHit:
+            number, result = one_function(traverse)((lanes, unfinished[n]))
+            return jax.tree.map(lambda a, b: a.at[number].set(b), hit, result)
+
+        return lax.fori_loop(0, jnp.sum(lanes.active, dtype=jnp.int32), one_lane, hit)
 
     idle = send(jnp.full(n_lanes, n_rays, jnp.int32))
     state = vary_with(_RayQueue(idle, jnp.zeros((), jnp.int32), missed), (tree, x, w, waits))
     state = lax.while_loop(goes_on, take_turns, state)
-    hit = note(state.hit, state.lanes)
-    return jax.tree.map(lambda a: a[:n_rays].reshape(shape), hit)
+    return jax.tree.map(lambda a: a[:n_rays].reshape(shape), finish(state))
+
+
+def _result(rays: _TreeTraversal) -> TriangleHit:
+    """Return what rays have met that have come to their ends."""
+    distance = jnp.where(rays.row > 0, rays.distance, FAR)
+    return TriangleHit(distance, rays.row, rays.leaf, None if rays.walk is None else rays.walk.cell)
 
 
 def _enter_cells(tree: TriangleTree, x: Vec, w: Vec, precision: float) -> _CellWalk:
@@ -537,7 +559,7 @@ def _next_on_trail(node: Array, trail: Array) -> tuple[Array, Array, Array]:
 
 def _box_distance(
     low: list[Scalar], high: list[Scalar], x: Vec, inverse: Vec, largest: Scalar, precision: float
-) -> tuple[Bool[Array, "rays"], Scalar]:
+) -> tuple[Bool[Array, "*rays"], Scalar]:
     """Return True where rays meet a box, no farther than `largest`, and where they enter it, m."""
     enter, leave = jnp.zeros_like(largest), largest
     for a, b, start, rate in zip(low, high, x, inverse):
@@ -563,17 +585,23 @@ def _triangle_distance(row: list[Scalar], x: Vec, w: Vec, one_sided: Array | int
     along_last = jnp.where(jnp.abs(direction[2]) > 0, direction[2], 1.0)
     shear_x, shear_y, inverse = direction[0] / along_last, direction[1] / along_last, 1.0 / along_last
 
-    def seen_along_ray(k: int) -> Vec:
-        """Return a corner, relative to the start, sheared so that the ray is the last axis."""
-        p = permute(vec(a - b for a, b in zip(row[k : k + 3], x)))
-        return p[0] - shear_x * p[2], p[1] - shear_y * p[2], inverse * p[2]
+    def seen_along_ray(k: int) -> tuple[Vec, Scalar, Scalar]:
+        """Return a corner, relative to the start, sheared so that the ray is the last axis.
 
-    a, b, c = (seen_along_ray(k) for k in (0, 3, 6))
+        Also its distance from the ray, and from the start of the ray, as sums of coordinates.
+        """
+        p = permute(vec(a - b for a, b in zip(row[k : k + 3], x)))
+        seen = p[0] - shear_x * p[2], p[1] - shear_y * p[2], inverse * p[2]
+        return seen, jnp.abs(seen[0]) + jnp.abs(seen[1]), jnp.abs(p[0]) + jnp.abs(p[1]) + jnp.abs(p[2])
+
+    corners = [seen_along_ray(k) for k in (0, 3, 6)]
+    a, b, c = (seen for seen, _, _ in corners)
     areas, roundings = [], []
-    for p, q in ((c, b), (a, c), (b, a)):
-        first, second = p[0] * q[1], p[1] * q[0]
-        areas.append(first - second)
-        roundings.append(_AREA_ROUNDING * precision * (jnp.abs(first) + jnp.abs(second)))
+    for i, j in ((2, 1), (0, 2), (1, 0)):
+        (p, from_ray, size), (q, other_from_ray, other_size) = corners[i], corners[j]
+        areas.append(p[0] * q[1] - p[1] * q[0])
+        bound = size * other_from_ray + other_size * from_ray
+        roundings.append(_AREA_ROUNDING * precision * bound)
     is_inside = jnp.ones_like(z_largest)
     is_inside_reversed = is_inside
     for area, rounding in zip(areas, roundings):

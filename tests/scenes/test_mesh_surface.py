@@ -47,6 +47,42 @@ def nearest_by_all_pairs(corners, x, w):
     return distances
 
 
+def nearest_by_embree(mesh, x, w):
+    """Return distances to the triangles that Embree finds first, computed from their planes in float64."""
+    pytest.importorskip("embreex")
+    number = mesh.ray.intersects_first(x, w)
+    normal, corner = mesh.face_normals[number], mesh.triangles[number][:, 0]
+    distance = ((corner - x) * normal).sum(axis=1) / (w * normal).sum(axis=1)
+    return np.where(number < 0, FAR, distance)
+
+
+@BY_PRECISION
+def test_rays_agree_with_embree(precision):
+    """10,000 rays through two bumpy spheres, one in the other: every ray from within meets a triangle."""
+    random = np.random.default_rng(5)
+    size = 8.0
+    spheres = []
+    for radius in (2.0, 0.5 * size):
+        sphere = trimesh.creation.icosphere(subdivisions=3, radius=radius)
+        sphere.vertices *= random.uniform(0.8, 1.0, (len(sphere.vertices), 1))
+        spheres.append(sphere)
+    mesh = trimesh.util.concatenate(spheres)
+    x, w = random.uniform(-1.0, 1.0, (10_000, 3)), directions(10_000, random)
+    # Half of the rays aim at points on edges.
+    ends = mesh.vertices[mesh.edges_unique[random.integers(len(mesh.edges_unique), size=5_000)]]
+    targets = ends[:, 0] + random.uniform(0, 1, (5_000, 1)) * (ends[:, 1] - ends[:, 0])
+    w[:5_000] = targets - x[:5_000]
+    w /= np.linalg.norm(w, axis=1, keepdims=True)
+    distance, _ = meet([jl.MeshSurface(mesh)], x, w)
+    assert np.all(distance < FAR)
+    expected = nearest_by_embree(mesh, x, w)
+    wrong = np.abs(distance - expected) > 1e-5 * size
+    # Rays that aim at the outline of a bump meet it or pass it within rounding.
+    assert not wrong[5_000:].any()
+    assert wrong.sum() <= 5
+    assert np.mean(np.abs(np.roll(distance, 1) - expected) > 1e-5 * size) > 0.9
+
+
 @BY_PRECISION
 def test_rays_meet_the_nearest_triangle(precision):
     random = np.random.default_rng(0)
