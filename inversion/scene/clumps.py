@@ -85,7 +85,7 @@ def clumped_leaves(
     >>> crowns = inversion.clumped_leaves(scene, density=0.6, size=(3.0, 4.0), key=jax.random.key(0))
     >>> lad = 2.0 * crowns.apply(scene, crowns.start).canopy.voxels.leaf
     >>> print(f"mean {float(lad.mean()):.2f}, largest {float(lad.max()):.2f} m2/m3")
-    mean 0.12, largest 0.60 m2/m3
+    mean 0.10, largest 0.60 m2/m3
     """
     check_kind("scene", scene, Scene, "a Scene")
     check_key(key)
