@@ -38,7 +38,7 @@
 
 ## The scene of many records
 
-`retrieve_scene`, `SceneRetrieval`, `SceneStep`, `MarkovField`, `geolocate`, `Geolocation`.
+`retrieve_scene`, `SceneRetrieval`, `SceneStep`, `MarkovField`, `clumped_leaves`, `geolocate`, `Geolocation`.
 
 ## Receivers and digitisers
 
@@ -89,6 +89,7 @@ from inversion.receiver.digitiser import Amplitudes, amplitudes, corrected_table
 from inversion.receiver.impulse import receiver_impulse, recorded_pulse
 from inversion.receiver.recorder import Recorder
 from inversion.receiver.shot_response import ShotResponse, shot_response
+from inversion.scene.clumps import clumped_leaves
 from inversion.scene.geolocation import Geolocation, geolocate
 from inversion.scene.retrieval import SceneStep, retrieve_scene
 from inversion.scene.scene_retrieval import SceneRetrieval
@@ -158,6 +159,7 @@ __all__ = [
     "SceneRetrieval",
     "SceneStep",
     "MarkovField",
+    "clumped_leaves",
     "geolocate",
     "Geolocation",
     # Receivers and digitisers.

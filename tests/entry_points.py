@@ -791,6 +791,12 @@ ENTRY_POINTS: dict[str, Callable[[], EntryPoint]] = {
             "least": 5,
         },
     ),
+    "inversion.clumped_leaves": lambda: EntryPoint(
+        lambda **arguments: inversion.clumped_leaves(
+            jl.Scene(canopy=jl.Canopy(VOXELS, leaf=LEAF)), key=KEY, **arguments
+        ),
+        {"density": 0.6, "size": (3.0, 4.0)},
+    ),
     "inversion.MarkovField": lambda: EntryPoint(inversion.MarkovField, {"difference": 0.1, "mean": 0.2}),
     "inversion.geolocate": lambda: EntryPoint(
         lambda **arguments: inversion.geolocate(

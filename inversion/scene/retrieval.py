@@ -144,7 +144,8 @@ def retrieve_scene(
     that overlap, with noise that grows quickly as detail becomes finer, and from the priors. Leaves in clumps
     smaller than a footprint, such as crowns, let more light through than the same leaves spread evenly, and
     records of wide footprints do not tell the two apart: with a smooth prior the result is the effective leaf
-    area, which may be half of the true one. Standard errors and draws do not contain this. The shape of the
+    area, which may be half of the true one; state clumps by `clumped_leaves` where you know them. Standard
+    errors and draws do not contain this, and the misfit does not show it. The shape of the
     profile suffers less. Little light comes from below dense leaves. Waveforms determine the product of area
     and reflectance better than either: keep leaf and ground reflectance fixed or give them priors; and a free
     gain is the same as a common factor of all reflectances. Look at `stderr`, at the kernels of some places
@@ -159,7 +160,7 @@ def retrieve_scene(
       apparent reflectance, up to the `gain` and the `offset`; then give `time`.
     - `survey`: the `Survey`, with one shot for each record.
     - `scene`: the scene; unknowns start from its values.
-    - `unknowns`: a sequence of `Unknown`. Give maps a `MarkovField` as prior.
+    - `unknowns`: a sequence of `Unknown`. Give maps a `MarkovField` as prior, or leaves `clumped_leaves`.
     - `noise`: one standard deviation of `waveforms`, in (0, inf], anything that broadcasts to them. Infinity
       leaves a sample out.
     - `key`: a JAX random key, for the simulation, the choice of the shots held out, and errors.
