@@ -19,10 +19,16 @@ reason `pai` and `cover` are not those of the layers but of the energy split at 
 (`inversion.ground_and_canopy`), which are nearer to the product's; the layers' sum is `pai_layers`. Relative
 heights are the fitted waveform's, read by the product's rules (`inversion.gedi_metrics`).
 
-Of 60 shots of a savanna, 44 are rated good and none bad. The ground is within 0.07 m of the product's in the
-median and within 0.43 m in all good ones, and two standard errors (0.13 m each, in the median) cover it in
-all of them. Rank correlations with the product are 0.98 for RH98, 0.85 for `pai` (0.82 for plant area above
-0.1), 0.46 for `pai_layers`, and 0.63 for the canopy's fitted top, which the layers' prior blurs.
+**The closed forms of `inversion.gedi_table` are the first choice.** Of 60 shots of a savanna, 44 are rated
+good and none bad. The ground is low, by 0.09 m from the product's in the median and by 0.32 m or more in a
+tenth of the good shots; the matched mode is within 0.02 m in the median and 0.08 m in all. Relief is the
+cause: it gives the ground's echo shoulders, which a plane under plants explains by low plants, with the
+ground below them. A quick model of the same echoes, without the prior, puts the ground up to 2.8 m low;
+smoothing and tail of the receiver (`inversion.shot_response`) move it by 0.01 m in the median. Two standard
+errors of the ground cover the product's in all good shots, but only as they include the difference from the
+matched mode; those of the fit alone cover 84 %. Rank correlations with the product are 0.98 for RH98, 0.91
+for `pai` (0.90 above 0.1, in the median 0.86 of the product's), 0.39 for `pai_layers`, and 0.75 for the
+canopy's fitted top, which the layers' prior blurs.
 """
 
 import argparse
