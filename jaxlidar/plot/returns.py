@@ -305,7 +305,7 @@ def _oblique_axes(
     for name, centre, side in zip(("xlim", "ylim", "zlim"), middle, sides):
         ax.set(**{name: (centre - 0.5 * side, centre + 0.5 * side)})
     # The corners of a wide box, and their labels, would extend beyond the edges of the axes.
-    zoom: Any = 0.8
+    zoom: Any = 0.58
     ax.set_box_aspect(sides.tolist(), zoom=zoom)
     # matplotlib's azimuth is counted from the x axis, counterclockwise.
     ax.view_init(elev=elevation, azim=90.0 - azimuth)

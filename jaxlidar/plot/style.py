@@ -89,13 +89,23 @@ def limit_height(ax: Axes, height: Float[np.ndarray, " bins"], total: np.ndarray
     ax.set_ylabel("height (m)")
 
 
+class _UpperTicks(MaxNLocator):
+    """Ticks but for those near the lower end. `prune` of matplotlib leaves them where a tick lies below."""
+
+    def __call__(self) -> np.ndarray:
+        assert self.axis is not None
+        low, high = sorted(self.axis.get_view_interval())
+        ticks = np.asarray(super().__call__())
+        return ticks[ticks > low + 0.1 * (high - low)]
+
+
 def label_map(ax: Axes) -> None:
     """Set equal scales and the labels of a map."""
     ax.set_aspect("equal")
     # Map coordinates have seven digits: few ticks, none with an offset or an exponent, and none at the lower
     # left, where both axes would have one.
-    for axis, prune in ((ax.xaxis, None), (ax.yaxis, "lower")):
-        axis.set_major_locator(MaxNLocator(nbins=4, prune=prune))
+    ax.xaxis.set_major_locator(MaxNLocator(nbins=4))
+    ax.yaxis.set_major_locator(_UpperTicks(nbins=4))
     ax.ticklabel_format(style="plain", useOffset=False)
     ax.tick_params(axis="y", labelrotation=90)
     ax.set_xlabel("x, east (m)")

@@ -1,0 +1,117 @@
+"""Scan a tree from a tripod. Run it as `python examples/terrestrial.py [--step 1] [--out figures]`.
+
+A RIEGL VZ-400 stands 14 m from the paper's tree (Table 2) and turns about a vertical axis, with an angular
+step that is coarser than the instrument's. Its returns are drawn as the scanner sees them and from the side.
+By height, the share of its returns from leaves is set beside the share of leaf area: one scan sees less of
+the upper crown, which the lower one hides.
+"""
+
+import argparse
+from collections.abc import Sequence
+from pathlib import Path
+
+import jax
+import matplotlib
+
+matplotlib.use("Agg")
+import matplotlib.pyplot as plt
+import numpy as np
+from matplotlib.figure import Figure
+
+import jaxlidar as jl
+import jaxlidar.plot
+from jaxlidar.io import atomic_write
+
+# Position of the scanner, m: 14 m south of the stem.
+SENSOR = np.array([0.0, -14.0, 1.7])
+VOXEL_SIZE, LEAF_AREA = 0.25, 0.004
+LAYER = 1.0
+
+
+def tree_scene() -> tuple[jl.Scene, jl.VoxelMap]:
+    """Return the tree over level ground, and its voxel map."""
+    voxels = jl.voxelise(jl.grow(jl.broadleaf(), seed=0), VOXEL_SIZE, leaf_area=LEAF_AREA, wood="surface")
+    canopy = jl.Canopy(voxels, leaf=jl.Prospect(), bark=jl.spectrum("bark-oak"))
+    return jl.Scene(canopy=canopy, ground=jl.Ground(reflectance=jl.spectrum("soil-medium"))), voxels
+
+
+def scan(step: float) -> jl.Survey:
+    """Return the shots of a turning scanner that looks at the tree, `step` degrees apart both ways."""
+    lidar = jl.instrument("RIEGL VZ-400")
+    azimuth, elevation = np.arange(-32.0, 32.0 + step, step), np.arange(-12.0, 56.0 + step, step)
+    # The head looks along one vertical line after the other.
+    azimuth, elevation = (a.ravel() for a in np.meshgrid(azimuth, elevation, indexing="ij"))
+    sensor = np.tile(SENSOR, (azimuth.size, 1))
+    return jl.Survey(lidar, sensor=sensor, zenith=90.0 + elevation, azimuth=azimuth)
+
+
+def profiles(returns: jl.DiscreteReturns, voxels: jl.VoxelMap) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the edges of layers, m, and the shares of returns from leaves and of leaf area in each."""
+    assert voxels.leaf is not None
+    leaf = np.asarray(voxels.leaf, float).sum(axis=(0, 1))
+    z = float(voxels.origin[2]) + VOXEL_SIZE * (np.arange(leaf.size) + 0.5)
+    edges = np.arange(0.0, z.max() + LAYER, LAYER)
+    is_leaf = returns.material == "leaf"
+    seen = np.histogram(returns.position[is_leaf, 2], edges)[0]
+    present = np.histogram(z, edges, weights=leaf)[0]
+    return edges, seen / seen.sum(), present / present.sum()
+
+
+def draw(survey: jl.Survey, returns: jl.DiscreteReturns, voxels: jl.VoxelMap, step: float) -> Figure:
+    """Draw the view of the scanner, the points from the side, and the profiles."""
+    figure = plt.figure(figsize=(12.5, 4.3), layout="constrained")
+    view, side, profile = figure.subplots(1, 3, width_ratios=(1.1, 1.0, 0.75))
+    is_first = returns.number == 1
+    shot = returns.shot[is_first]
+    image = view.scatter(
+        np.asarray(survey.azimuth)[shot],
+        np.asarray(survey.zenith)[shot] - 90.0,
+        c=returns.range[is_first],
+        # Squares as wide as a step of the scan.
+        s=(4.0 * step) ** 2,
+        marker="s",
+        cmap="viridis_r",
+        linewidths=0,
+        rasterized=True,
+    )
+    figure.colorbar(image, ax=view, label="range of the first return (m)", shrink=0.85)
+    view.set(title="as the scanner sees it", xlabel="azimuth (degrees)", ylabel="elevation (degrees)")
+    for material, colour in (("ground", "#8c6d46"), ("leaf", "#009E73"), ("bark", "#3b2a1a")):
+        _, y, z = returns.position[returns.material == material].T
+        side.scatter(
+            y - SENSOR[1], z, s=5.0 * step, color=colour, linewidths=0, label=material, rasterized=True
+        )
+    side.plot(0.0, SENSOR[2], "^", color="#D55E00", label="scanner")
+    side.set(title="from the side", xlabel="distance to the north (m)", ylabel="height (m)", aspect="equal")
+    side.set_ylim(-0.5, 20.5)
+    side.legend(frameon=False, fontsize=8, loc="upper left", ncols=2)
+    edges, seen, present = profiles(returns, voxels)
+    profile.stairs(present, edges, orientation="horizontal", label="leaf area", color="k")
+    profile.stairs(seen, edges, orientation="horizontal", label="returns from leaves", color="#009E73")
+    profile.set(title="what one scan sees", xlabel="share of the tree in each metre", ylabel="height (m)")
+    profile.legend(frameon=False, fontsize=8)
+    return figure
+
+
+def main(arguments: Sequence[str] | None = None) -> jl.DiscreteReturns:
+    """Scan the tree, print numbers, draw the figure and return the discrete returns."""
+    parser = argparse.ArgumentParser(description="Scan a tree from a tripod.")
+    parser.add_argument("--step", type=float, default=1.0, help="angular step, degrees")
+    parser.add_argument("--out", type=Path, default=Path("."), help="folder of the figure")
+    options = parser.parse_args(arguments)
+    scene, voxels = tree_scene()
+    survey = scan(options.step)
+    many = jl.simulate_many(survey, scene, key=jax.random.key(0), rtol=0.1, max_orders=1, truth=True)
+    returns = many.returns()
+    edges, seen, present = profiles(returns, voxels)
+    middle = 0.5 * (edges[1:] + edges[:-1])
+    print(returns)
+    print(f"mean height of leaf area {present @ middle:.1f} m, of returns from leaves {seen @ middle:.1f} m")
+    options.out.mkdir(parents=True, exist_ok=True)
+    with atomic_write(options.out / "terrestrial.png") as draft:
+        draw(survey, returns, voxels, options.step).savefig(draft, dpi=80, format="png")
+    return returns
+
+
+if __name__ == "__main__":
+    main()
