@@ -42,7 +42,8 @@
 
 ## Receivers and digitisers
 
-`Recorder`, `receiver_impulse`, `recorded_pulse`, `amplitudes`, `Amplitudes`, `corrected_table`.
+`Recorder`, `receiver_impulse`, `shot_response`, `ShotResponse`, `recorded_pulse`, `amplitudes`, `Amplitudes`,
+`corrected_table`.
 
 ## Leaf traits from leaf spectra
 
@@ -87,6 +88,7 @@ from inversion.metrics.points import EchoPoints, echo_points
 from inversion.receiver.digitiser import Amplitudes, amplitudes, corrected_table
 from inversion.receiver.impulse import receiver_impulse, recorded_pulse
 from inversion.receiver.recorder import Recorder
+from inversion.receiver.shot_response import ShotResponse, shot_response
 from inversion.scene.geolocation import Geolocation, geolocate
 from inversion.scene.retrieval import SceneStep, retrieve_scene
 from inversion.scene.scene_retrieval import SceneRetrieval
@@ -161,6 +163,8 @@ __all__ = [
     # Receivers and digitisers.
     "Recorder",
     "receiver_impulse",
+    "shot_response",
+    "ShotResponse",
     "recorded_pulse",
     "amplitudes",
     "Amplitudes",

@@ -43,7 +43,8 @@ waveforms is in the package `inversion`.
 
 ## Plants
 
-`Habit`, `Branching`, `broadleaf`, `conifer`, `shrub`, `spreading_tree`, `grow`, `forest`, `Tree`,
+`Habit`, `Branching`, `broadleaf`, `conifer`, `shrub`, `spreading_tree`, `grow`, `forest`,
+`stand_of_leaf_area`, `stand_from_inventory`, `Stand`, `Inventory`, `Tree`,
 `LSystem`, `Rule`, `Symbol`, `Word`, `turtle`, `voxelise`, `voxelise_copies`, `voxelise_points`,
 `canopy_from_points`, `PointCanopy`, `voxelise_mesh`, `Mesh`, `mesh_of`, `trim_empty_layers`.
 
@@ -121,11 +122,13 @@ from jaxlidar.planning.effects import Effect
 from jaxlidar.planning.plan import Plan, plan
 from jaxlidar.planning.scene_family import plan_scenes
 from jaxlidar.planning.setup import Setup, make_setup
-from jaxlidar.plants.forest import forest
+from jaxlidar.plants.forest import forest, stand_of_leaf_area
 from jaxlidar.plants.habits import Branching, Habit, broadleaf, conifer, grow, shrub, spreading_tree
+from jaxlidar.plants.inventory import Inventory, stand_from_inventory
 from jaxlidar.plants.lsystem import LSystem, Rule, Symbol, Word
 from jaxlidar.plants.meshes import Mesh, SolidMeshWarning, mesh_of, voxelise_mesh
 from jaxlidar.plants.point_canopy import PointCanopy, canopy_from_points
+from jaxlidar.plants.stand import Stand
 from jaxlidar.plants.tree import Tree
 from jaxlidar.plants.turtle import turtle
 from jaxlidar.plants.voxelise import trim_empty_layers, voxelise, voxelise_copies, voxelise_points
@@ -245,6 +248,10 @@ __all__ = [
     "spreading_tree",
     "grow",
     "forest",
+    "stand_of_leaf_area",
+    "stand_from_inventory",
+    "Stand",
+    "Inventory",
     "Tree",
     "LSystem",
     "Rule",

@@ -385,6 +385,22 @@ ENTRY_POINTS: dict[str, Callable[[], EntryPoint]] = {
         {"density": 0.05, "area": (9.0, 9.0), "minimum_distance": 1.0, "shares": [0.5, 0.5]}
         | {"size": (1.0, 1.0), "individuals": 2, "origin": (0.0, 0.0, 0.0), "seed": 0},
     ),
+    "stand_of_leaf_area": lambda: EntryPoint(
+        lambda **arguments: jl.stand_of_leaf_area(habits=jl.shrub(height=0.5, stems=1), **arguments),
+        {"leaf_area_index": 1.0, "heights": np.array([0.5, 1.0]), "density": 0.05, "area": (9.0, 9.0)}
+        | {"minimum_distance": 1.0, "shares": [1.0], "individuals": 1, "origin": (0.0, 0.0, 0.0), "seed": 0},
+    ),
+    "stand_from_inventory": lambda: EntryPoint(
+        lambda **arguments: jl.stand_from_inventory(
+            {"x": [0.0], "y": [0.0], "height": [0.5]}, jl.shrub(height=0.5, stems=1), **arguments
+        ),
+        {"leaf_area_index": 1.0, "area": 9.0, "individuals": 1, "seed": 0},
+    ),
+    "Stand": lambda: EntryPoint(
+        lambda **arguments: jl.Stand(TREE, **arguments),
+        {"position": np.zeros((2, 3)), "individual": np.zeros(2, int), "azimuth": np.zeros(2)}
+        | {"scale": np.ones((2, 3)), "leaf_area": 0.1},
+    ),
     "Tree": lambda: EntryPoint(
         jl.Tree,
         {"start": np.zeros((2, 3)), "end": np.ones((2, 3)), "radius_start": np.ones(2)}
@@ -413,7 +429,8 @@ ENTRY_POINTS: dict[str, Callable[[], EntryPoint]] = {
     "voxelise_copies": lambda: EntryPoint(
         lambda **arguments: jl.voxelise_copies(TREE, **arguments),
         {"position": np.zeros((2, 3)), "voxel_size": 0.5, "leaf_area": 1.0, "samples": 2}
-        | {"individual": np.zeros(2, int), "azimuth": np.zeros(2), "offsets": 1, "azimuths": 1},
+        | {"individual": np.zeros(2, int), "azimuth": np.zeros(2), "offsets": 1, "azimuths": 1}
+        | {"scale": np.ones((2, 3)), "origin": (-1.0, -1.0, 0.0), "shape": (4, 4, 4)},
     ),
     "canopy_from_points": lambda: EntryPoint(
         lambda **arguments: jl.canopy_from_points(point_cloud(), **arguments),
@@ -818,6 +835,19 @@ ENTRY_POINTS: dict[str, Callable[[], EntryPoint]] = {
         ),
         {"pulses": RECORDED_PULSE, "echoes": POWER, "noise": np.full(60, 0.01), "before": 2, "after": 4}
         | {"interleaved": 1},
+    ),
+    "inversion.shot_response": lambda: EntryPoint(
+        lambda signal, noise_std, pulse_time, pulse_power, fraction: inversion.shot_response(
+            [
+                types.SimpleNamespace(
+                    signal=signal, noise_std=noise_std, pulse_time=pulse_time, pulse_power=pulse_power
+                )
+            ]
+            * 3,
+            fraction=fraction,
+        ),
+        {"signal": np.exp(-0.5 * ((np.arange(300.0) - 100.0) / 7.0) ** 2), "noise_std": 0.01}
+        | {"pulse_time": np.arange(21.0) - 10.0, "pulse_power": RECORDED_PULSE, "fraction": 0.5},
     ),
     "inversion.recorded_pulse": lambda: EntryPoint(
         inversion.recorded_pulse, {"time": np.arange(21.0), "power": RECORDED_PULSE, "finer": 4}

@@ -105,7 +105,14 @@ RESULTS = (
     *("SceneWaveforms", "ReflectanceFactor", "inversion.Design", "inversion.LogDensity"),
     *("Plan", "Effect", "Setup", "Response", "AnalogReturns", "io.DemRead", "io.GediShot", "io.MeshRead"),
     *("io.NeonImpulse", "io.NeonRead", "io.PointCloud", "io.Returns", "io.Scanner", "io.ShotStack"),
-    *("io.TreeRead", "io.VoxelsRead", "io.AirborneShots", "inversion.Retrieval", "inversion.Retrievals"),
+    *(
+        "Inventory",
+        "io.TreeRead",
+        "io.VoxelsRead",
+        "io.AirborneShots",
+        "inversion.Retrieval",
+        "inversion.Retrievals",
+    ),
     *("inversion.Step", "inversion.RetrievalProgress", "inversion.AveragingKernel", "inversion.CramerRao"),
     *("inversion.Profile", "inversion.Verdict", "inversion.Echoes", "inversion.EchoPoints"),
     *("inversion.SignalEnds", "inversion.GroundAndCanopy", "inversion.GediMetrics"),
@@ -121,10 +128,11 @@ RESULTS = (
     *("io.ColumnAxis", "io.Column", "io.ShotTable", "io.PhotonImpulse", "io.PhotonTrack"),
     *("inversion.TableProgress", "inversion.Comparison", "inversion.ComparisonStatistics"),
     *("inversion.ComparedColumn", "inversion.SceneRetrieval", "inversion.SceneStep"),
+    "inversion.ShotResponse",
 )
 OF_OBJECTS = (
     *("instrument", "instruments", "instrument_sources", "compilation_cache", "simulate_scenes"),
-    *("ground_position", "io.read_trajectory"),
+    *("ground_position", "io.read_trajectory", "io.read_inventory"),
     # Its numbers are those of a lidar, and of `plan`; the noise may be a function.
     "inversion.design",
     *("total_reflectance", "open", "rerun", "Scene", "load_coefficients", "spectrum_names"),

@@ -19,6 +19,7 @@ from jaxlidar.io.gedi import GediShot, read_gedi_l1b
 from jaxlidar.io.gedi_level2 import read_gedi_l2a, read_gedi_l2b
 from jaxlidar.io.gedi_writer import write_gedi_l1b
 from jaxlidar.io.icesat2 import PhotonImpulse, PhotonTrack, read_atl03, read_atl08
+from jaxlidar.io.inventory import read_inventory
 from jaxlidar.io.las import read_las, write_las
 from jaxlidar.io.las_waveforms import read_las_waveforms, write_las_waveforms
 from jaxlidar.io.lvis import read_lvis_l1b, read_lvis_l2
@@ -64,6 +65,7 @@ __all__ = [
     "read_gedi_l1b",
     "read_gedi_l2a",
     "read_gedi_l2b",
+    "read_inventory",
     "read_las",
     "read_las_waveforms",
     "read_lvis_l1b",

@@ -33,7 +33,15 @@ from jaxlidar.instrument.lidar import Lidar
 from jaxlidar.instrument.survey import Survey
 from jaxlidar.io.kinds import UNITS, Argument
 from jaxlidar.io.npz import read_arrays
-from jaxlidar.io.toml import ArrayReader, check_keys, table_of, tables_of, text_of, value_of
+from jaxlidar.io.toml import (
+    ArrayReader,
+    check_keys,
+    table_of,
+    tables_of,
+    text_of,
+    value_of,
+    with_references,
+)
 from jaxlidar.scenes.scene import Scene
 from jaxlidar.simulate import simulate
 
@@ -179,6 +187,7 @@ def case_of(text: str, path: Path, read_array: ArrayReader) -> Case:
     try:
         tables = tables_of(text, path)
         check_keys(tables, _SECTIONS, "")
+        tables = with_references(tables)
         survey = tables.get("survey")
         if isinstance(survey, dict) and "lidar" not in survey and "lidar" in tables:
             # The lidar of the case is that of its survey.

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import numpy as np
 
-from jaxlidar._checks import concrete_array
+from jaxlidar._checks import check_kind, concrete_array
 from jaxlidar._deprecated import RENAMED, warn_renamed
 from jaxlidar._registry import public_objects
 from jaxlidar.instrument.catalogue import instrument
@@ -21,17 +21,24 @@ from jaxlidar.instrument.receiver import Receiver
 from jaxlidar.instrument.survey import Survey
 from jaxlidar.instrument.trajectory import Trajectory
 from jaxlidar.io.dem import DemRead, read_dem
+from jaxlidar.io.inventory import read_inventory
+from jaxlidar.io.las import read_las
 from jaxlidar.io.obj import MeshRead, read_obj
+from jaxlidar.io.qsm import TreeRead, read_qsm
 from jaxlidar.io.trajectory import read_trajectory
 from jaxlidar.io.vox import VoxelsRead, read_vox
 from jaxlidar.optics.coefficients import Coefficients, load_coefficients
 from jaxlidar.optics.leaf_angles import LeafAngles
 from jaxlidar.optics.prospect import Prospect
 from jaxlidar.optics.spectra import read_spectrum_csv, spectrum
-from jaxlidar.plants.forest import forest
+from jaxlidar.plants.forest import forest, stand_of_leaf_area
 from jaxlidar.plants.habits import Branching, Habit, broadleaf, conifer, grow, shrub, spreading_tree
-from jaxlidar.plants.meshes import Mesh, voxelise_mesh
-from jaxlidar.plants.voxelise import trim_empty_layers, voxelise
+from jaxlidar.plants.inventory import stand_from_inventory
+from jaxlidar.plants.meshes import Mesh, mesh_of, voxelise_mesh
+from jaxlidar.plants.point_canopy import PointCanopy, canopy_from_points
+from jaxlidar.plants.point_cloud import PointCloud
+from jaxlidar.plants.stand import Stand
+from jaxlidar.plants.voxelise import trim_empty_layers, voxelise, voxelise_points
 from jaxlidar.scenes.mesh_surface import MeshInstances, MeshSurface
 from jaxlidar.scenes.surfaces import AbstractGround, AbstractSheet, Ground, Plate
 from jaxlidar.scenes.voxels import VoxelMap
@@ -43,12 +50,16 @@ _NO_KINDS = ("PhotonEvents",)
 # Functions that return scenes or lidars, or objects in them, and classes of other packages.
 _FUNCTIONS: tuple[Callable[..., Any], ...] = (
     *(Branching, Habit, broadleaf, conifer, shrub, spreading_tree, grow, forest),
-    *(voxelise, voxelise_mesh, trim_empty_layers, Mesh),
+    *(stand_of_leaf_area, stand_from_inventory, read_inventory, Stand, Stand.above, Stand.joined),
+    *(voxelise, voxelise_mesh, trim_empty_layers, Mesh, mesh_of, VoxelMap.above),
+    *(canopy_from_points, voxelise_points, read_las, read_qsm),
     *(VoxelMap.from_lad, VoxelMap.from_extinction, VoxelMap.from_probability),
     *(Survey.grid, Survey.track, Survey.scan, Survey.fly, read_trajectory, instrument),
     *(LeafAngles.named, LeafAngles.beta, Prospect.paper),
     *(spectrum, read_spectrum_csv, read_vox, read_dem, read_obj, load_coefficients, Coefficients),
 )
+# Methods among them, with the class of their object and the name of the argument that it is.
+_METHODS = {Stand.above: (Stand, "stand"), VoxelMap.above: (VoxelMap, "voxels")}
 # The class of a table without `kind`, by the abstract class that is admissible.
 _DEFAULT_CLASSES = {AbstractGround: Ground, AbstractSheet: Plate}
 # The class of such a table where several are admissible.
@@ -105,6 +116,7 @@ UNITS = {
     "heights": "m",
     "jitter": "ns",
     "leaf_area": "m2",
+    "leaf_length": "m",
     "length": "ns",
     "lidar_ratio": "sr",
     "line_rate": "1/s",
@@ -116,6 +128,7 @@ UNITS = {
     "minimum_distance": "m",
     "mounting": DEGREES,
     "origin": "m",
+    "points": "m",
     "position": "m",
     "pitch": DEGREES,
     "pulse_rate": "1/s",
@@ -149,6 +162,7 @@ UNITS = {
 UNITS_OF = {
     (Branching, "divergence"): DEGREES,
     (read_dem, "fill"): "m",
+    (stand_from_inventory, "area"): "m2",
     (MeshInstances, "rotation"): DEGREES,
     (Mesh, "vertices"): "m",
     (Survey.grid, "low"): "m",
@@ -205,6 +219,10 @@ def arguments_of(kind: Callable[..., Any]) -> Mapping[str, Argument]:
         if parameter.kind is parameter.VAR_KEYWORD:
             # The functions of habits, such as `broadleaf`, take changes of the fields of a `Habit`.
             return arguments_of(Habit)
+        if name == "self":
+            own_class, own_name = _METHODS[kind]
+            arguments[own_name] = Argument(own_class, True, "", own_name)
+            continue
         field = _FIELD_NAMES.get((kind, name), name)  # pyright: ignore[reportArgumentType, reportCallIssue]
         annotation = fields[field].type if field in fields else annotations.get(name, Any)
         unit = UNITS_OF.get((kind, name), UNITS.get(name, ""))  # pyright: ignore[reportArgumentType, reportCallIssue]
@@ -226,16 +244,28 @@ def _mesh_of_surface(surface: MeshSurface) -> Mesh:
     return Mesh(vertices, rows[:, :3], rows[:, 3], surface.materials or ("mesh",))
 
 
-def call_kind(kind: Callable[..., Any], arguments: Mapping[str, Any]) -> Any:
-    """Return the result of a class or function; of that of a reader, the voxel map, terrain or mesh alone.
+def call_kind(kind: Callable[..., Any], arguments: Mapping[str, Any], annotation: Any = Any) -> Any:
+    """Return the result of a class or function; of that of a reader, the object that `annotation` asks for.
 
-    **Raises:** what `kind` raises; ValueError where a reader left voxels out that no `fill` is given for.
+    **Raises:** what `kind` raises; ValueError where a reader left voxels out that no `fill` is given for, and
+    where a point cloud has no terrain.
     """
+    arguments = dict(arguments)
+    if kind in _METHODS:
+        own_class, own_name = _METHODS[kind]
+        check_kind(own_name, arguments[own_name], own_class, f"a {own_class.__name__}")
+        return kind(arguments.pop(own_name), **arguments)
+    if kind is voxelise_points and isinstance(arguments["points"], PointCloud):
+        arguments["points"] = arguments["points"].position
     result = kind(**arguments)
     if isinstance(result, DemRead):
         return result.terrain
     if isinstance(result, MeshRead):
         return result.mesh
+    if isinstance(result, TreeRead):
+        return result.tree
+    if isinstance(result, PointCanopy):
+        return _of_points(result, annotation)
     if not isinstance(result, VoxelsRead):
         return result
     left_out = ", ".join(f"{count} {reason}" for reason, count in result.dropped.items() if count)
@@ -244,6 +274,16 @@ def call_kind(kind: Callable[..., Any], arguments: Mapping[str, Any]) -> Any:
             f"the file has voxels without a density ({left_out}): give fill, the density that they take"
         )
     return result.voxels
+
+
+def _of_points(result: PointCanopy, annotation: Any) -> Any:
+    """Return the terrain of a point cloud where a ground is admissible, and its voxel map elsewhere."""
+    classes = [member for member in union_members(annotation) if isinstance(member, type)]
+    if not any(issubclass(member, AbstractGround) for member in classes):
+        return result.voxels
+    if result.terrain is None:
+        raise ValueError("points have no ground returns of which a terrain could be made")
+    return result.terrain
 
 
 def union_members(annotation: Any) -> tuple[Any, ...]:

@@ -140,8 +140,9 @@ def value_of(table: Any, argument: Argument, path: str, read_array: ArrayReader,
         return read_array(file, name)
     if "kind" not in table:
         kind = default_kind(annotation)
-        if kind is not None:
-            return _call(kind, table, path, read_array, folder)
+        # Where a mapping is admissible too, such as habits by species, keys tell which it is.
+        if kind is not None and (not admits_mapping(annotation) or set(table) <= set(arguments_of(kind))):
+            return _call(kind, table, path, read_array, folder, annotation)
         if admits_mapping(annotation):
             # Such as reflectances by material, of which each may be a spectrum.
             item = argument._replace(annotation=Any)
@@ -156,7 +157,7 @@ def value_of(table: Any, argument: Argument, path: str, read_array: ArrayReader,
     if not isinstance(name, str) or name not in kinds():
         raise ValueError(f"{path}.kind = {name!r} is no kind; {nearest(str(name), kinds())}")
     arguments = {key: entry for key, entry in table.items() if key != "kind"}
-    return _call(kinds()[name], arguments, path, read_array, folder)
+    return _call(kinds()[name], arguments, path, read_array, folder, annotation)
 
 
 def _kind_without_arguments(name: str, path: str, read_array: ArrayReader, folder: Path) -> Any:
@@ -170,9 +171,17 @@ def _kind_without_arguments(name: str, path: str, read_array: ArrayReader, folde
 
 
 def _call(
-    kind: Callable[..., Any], table: Mapping[str, Any], path: str, read_array: ArrayReader, folder: Path
+    kind: Callable[..., Any],
+    table: Mapping[str, Any],
+    path: str,
+    read_array: ArrayReader,
+    folder: Path,
+    annotation: Any = Any,
 ) -> Any:
-    """Return the result of a class or function with the arguments in a table. **Raises:** as `value_of`."""
+    """Return the result of a class or function with the arguments in a table, as `annotation` admits it.
+
+    **Raises:** as `value_of`.
+    """
     signature = arguments_of(kind)
     check_keys(table, signature, path)
     missing = [name for name, argument in signature.items() if argument.required and name not in table]
@@ -186,9 +195,45 @@ def _call(
     if isinstance(arguments.get("path"), str):
         arguments["path"] = folder / arguments["path"]
     try:
-        return call_kind(kind, arguments)
+        return call_kind(kind, arguments, annotation)
     except (ValueError, TypeError) as error:
         raise type(error)(f"{path}: {error}") from error
+
+
+def with_references(tables: Mapping[str, Any]) -> dict[str, Any]:
+    """Return tables in which every reference, {same_as = "scene.ground"}, is the entry that it names.
+
+    **Raises:** ValueError, naming the place of the reference, for one that names no entry, or itself.
+    """
+
+    def entry_at(name: str, path: str) -> Any:
+        entry: Any = tables
+        for key in name.split("."):
+            if isinstance(entry, list) and key.isdigit() and int(key) < len(entry):
+                entry = entry[int(key)]
+            elif isinstance(entry, Mapping) and key in entry:
+                entry = entry[key]
+            else:
+                raise ValueError(f"{path}.same_as = {name!r} names no entry of the file")
+        return entry
+
+    def resolved(entry: Any, path: str, pending: tuple[str, ...]) -> Any:
+        if isinstance(entry, list):
+            return [resolved(item, f"{path}.{i}", pending) for i, item in enumerate(entry)]
+        if not isinstance(entry, Mapping):
+            return entry
+        if "same_as" not in entry:
+            return {key: resolved(item, f"{path}.{key}".lstrip("."), pending) for key, item in entry.items()}
+        check_keys(entry, ("same_as",), path)
+        name = entry["same_as"]
+        if not isinstance(name, str):
+            raise TypeError(f"{path}.same_as is {kind_of(name)}; admissible is the path of an entry")
+        # An entry that holds the reference, or leads back to it, would have no end.
+        if name in pending or f"{path}.".startswith(f"{name}."):
+            raise ValueError(f"{path}.same_as = {name!r} refers to itself")
+        return resolved(entry_at(name, path), path, (*pending, name))
+
+    return resolved(tables, "", ())
 
 
 def check_keys(table: Mapping[str, Any], admissible: Iterable[str], path: str) -> None:

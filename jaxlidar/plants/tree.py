@@ -6,6 +6,7 @@ from typing import final
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from scipy import spatial
 
 from jaxlidar._checks import briefly, check_kind, check_number, check_range, check_shape
 
@@ -132,6 +133,18 @@ class Tree:
     def trunk_diameter(self) -> float:
         """Diameter of the thickest stem at its base, m."""
         return 2 * float(self.radius_start[self.roots].max(initial=0.0))
+
+    @property
+    def crown_diameter(self) -> float:
+        """Diameter of the crown, m: that of a circle as large as the convex hull of the crown from above.
+
+        The hull is that of the centres of the leaf clumps, and without clumps of the ends of the wood.
+        """
+        points = (self.bud_position if len(self.bud_position) else self.end)[:, :2]
+        # A hull has an area where points are not on one line.
+        if np.linalg.matrix_rank(points - points.mean(axis=0) if len(points) else points, tol=1e-9) < 2:
+            return 0.0
+        return float(2.0 * np.sqrt(spatial.ConvexHull(points).volume / np.pi))
 
     @property
     def smallest_diameter(self) -> float:

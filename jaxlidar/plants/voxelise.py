@@ -23,8 +23,8 @@ neighbouring voxels is uncertain: a voxel that the side of a trunk cuts through 
 volume with 8 samples (root mean square, measured).
 """
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -40,6 +40,7 @@ from jaxlidar._checks import (
     kind_of,
 )
 from jaxlidar.plants.grid import Grid, voxel_edges
+from jaxlidar.plants.stand import Stand
 from jaxlidar.plants.tree import Tree
 from jaxlidar.scenes.voxels import VoxelMap
 
@@ -52,6 +53,10 @@ _LOW_DISCREPANCY = 0.7548776662466927
 _SAMPLED_CHUNK, _UNDIVIDED_CHUNK = 2000, 500_000
 # Largest number of points of one solid: more would not change a voxel by 0.1 %.
 _MAX_POINTS = 200_000
+# Small voxels along an edge, and azimuths, of the individuals of a stand.
+_OFFSETS, _AZIMUTHS = 4, 16
+# Distance, in voxels, within which faces coincide: the rounding of map coordinates.
+_FACE_TOLERANCE = 1e-7
 
 
 def voxelise(
@@ -63,20 +68,25 @@ def voxelise(
     samples: int = 8,
     origin: tuple[float, float, float] | None = None,
     shape: tuple[int, int, int] | None = None,
+    progress: Callable[[int, int], None] | None = None,
 ) -> VoxelMap:
     """Voxelise leaf and bark of one tree, or of several trees together.
 
     Where solids overlap, as branches do at joints, a voxel is at most full. The excess volume goes to the
     voxels around it, so that volumes are conserved.
 
+    A `Stand`, such as `forest` makes, is voxelised by its individuals, as `voxelise_copies` does: azimuths
+    are rounded to multiples of 22.5 degrees. To voxelise each of its trees for itself, which takes longer,
+    give them as a list.
+
     **Arguments:**
 
-    - `trees`: a `Tree`, or several, for instance a `forest`.
+    - `trees`: a `Tree`, several, or a `Stand`.
     - `voxel_size`: voxel edges in m, positive: one number for cubes, or three.
     - `leaf_area`: one-sided leaf area of every clump in m2, 0 or more, spread evenly through its sphere. The
       extinction coefficient of leaf is then area / (2 volume). None: a clump fills its sphere, and the
       probability of leaf is the fraction of the voxel that clumps occupy. The clump radius is that of the
-      tree; see `Tree.with_bud_radius`. Default None.
+      tree; see `Tree.with_bud_radius`. Default None; of a stand that has leaf areas: these.
     - `wood`: "volume": the probability of bark is the fraction of the voxel that wood occupies. Twigs much
       thinner than a voxel then intercept less light than their width would. "surface": the extinction
       coefficient is a quarter of the wood surface per volume, as for thin convex bodies of random orientation
@@ -85,6 +95,8 @@ def voxelise(
     - `origin`, `shape`: lower corner (x, y, z) in m and numbers of voxels (nx, ny, nz) of the grid; give both
       or neither. Default None: the smallest grid that holds all trees, with faces at multiples of the edge,
       so that the maps of neighbouring trees fit together.
+    - `progress`: of a stand: a function called with the numbers of trees that are done, and of all, after
+      each. Default None.
 
     **Returns:** a `VoxelMap`.
 
@@ -104,6 +116,22 @@ def voxelise(
     0.0010 m2 per clump
     """
     check_kind("trees", trees, Tree | Iterable, "a Tree or several")
+    if isinstance(trees, Stand):
+        if leaf_area is not None:
+            check_number("leaf_area", leaf_area, 0.0)
+        areas = trees.leaf_area if leaf_area is None else np.full(len(trees), float(leaf_area))
+        return _voxelise_stand(
+            trees,
+            areas,
+            voxel_size,
+            wood=wood,
+            samples=samples,
+            offsets=_OFFSETS,
+            azimuths=_AZIMUTHS,
+            origin=origin,
+            shape=shape,
+            progress=progress,
+        )
     trees = [trees] if isinstance(trees, Tree) else list(trees)
     size = voxel_edges(voxel_size)
     check_choice("wood", wood, ("volume", "surface"))
@@ -158,35 +186,40 @@ def voxelise_copies(
     *,
     individual: Int[np.ndarray, " n"] | None = None,
     azimuth: Float[np.ndarray, " n"] | None = None,
-    leaf_area: float | None = None,
+    scale: Float[np.ndarray, "n 3"] | None = None,
+    leaf_area: float | Float[np.ndarray, " n"] | None = None,
     wood: str = "volume",
     samples: int = 8,
-    offsets: int = 4,
-    azimuths: int = 16,
+    offsets: int = _OFFSETS,
+    azimuths: int = _AZIMUTHS,
+    origin: tuple[float, float, float] | None = None,
+    shape: tuple[int, int, int] | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> VoxelMap:
     """Voxelise a stand of many copies of a few trees.
 
-    Each individual is voxelised once per azimuth, on a grid that is `offsets` times finer. Sums of fine
-    voxels then give each copy its own position within the voxels. A copy stands at the multiple of
-    voxel_size / offsets, and at the multiple of 360 / azimuths degrees, that is nearest to what is asked for:
-    at most voxel_size / (2 offsets) along each axis, and 180 / azimuths degrees, away. Volumes and leaf areas
-    are those of the copies, to rounding. The time hardly grows with their number.
+    Each individual is voxelised once per azimuth, on a grid whose voxels are `offsets` times smaller. The
+    small voxels are moved to the place of each copy, stretched by its scale, and divided among the voxels of
+    the stand by the volumes in which they overlap. Copies stand exactly at their positions; only azimuths are
+    rounded, to multiples of 360 / azimuths degrees. Volumes of wood and leaf areas are those of the copies.
 
     **Arguments:**
 
     - `individuals`: a `Tree`, or several.
     - `position`: (n, 3) x, y and z in m of the `base` of each copy.
-    - `voxel_size`, `leaf_area`, `wood`, `samples`: as those of `voxelise`. Points are at least as close as
-      there.
+    - `voxel_size`, `wood`, `samples`, `origin`, `shape`: as those of `voxelise`. Points are at least as close
+      as there.
     - `individual`: (n,) integers, which of the individuals each copy is of, from 0. Default None: the first.
     - `azimuth`: (n,) degrees by which each copy is turned clockwise. Default None: 0.
-    - `offsets`: positions within a voxel along each of its edges, an integer of at least 1. Default 4.
+    - `scale`: (n, 3) factors of each copy on horizontal distances from the base, on heights above it, and on
+      radii of wood, positive. Default None: 1.
+    - `leaf_area`: as that of `voxelise`: one number, or (n,) numbers, one for each copy. Default None.
+    - `offsets`: small voxels along each edge of a voxel, an integer of at least 1. Default 4.
     - `azimuths`: azimuths that copies have, an integer of at least 1. Default 16.
     - `progress`: a function called with the numbers of copies that are done, and of all, after each. Default
       None.
 
-    **Returns:** a `VoxelMap`: the smallest grid that holds all copies.
+    **Returns:** a `VoxelMap`: by default the smallest grid that holds all copies.
 
     **Raises:** as `voxelise`; ValueError for arrays of other shapes, for no copy, and for numbers of
     individuals that there are not.
@@ -201,91 +234,142 @@ def voxelise_copies(
     >>> print(f"{area / (500 * len(shrub.bud_position)):.4f} m2 per clump")
     0.0010 m2 per clump
     """
-    check_kind("individuals", individuals, Tree | Sequence, "a Tree or several")
-    trees = [individuals] if isinstance(individuals, Tree) else list(individuals)
-    for tree in trees:
-        check_kind("one of individuals", tree, Tree, "a Tree")
+    copies = Stand(individuals, position, individual, azimuth, scale, leaf_area)
+    return _voxelise_stand(
+        copies,
+        copies.leaf_area,
+        voxel_size,
+        wood=wood,
+        samples=samples,
+        offsets=offsets,
+        azimuths=azimuths,
+        origin=origin,
+        shape=shape,
+        progress=progress,
+    )
+
+
+def _voxelise_stand(
+    stand: Stand,
+    leaf_area: Float[np.ndarray, " n"] | None,
+    voxel_size: float | tuple[float, float, float],
+    *,
+    wood: str,
+    samples: int,
+    offsets: int,
+    azimuths: int,
+    origin: tuple[float, float, float] | None,
+    shape: tuple[int, int, int] | None,
+    progress: Callable[[int, int], None] | None,
+) -> VoxelMap:
+    """Voxelise a stand by its individuals; arguments as those of `voxelise_copies`.
+
+    1. Copies of one individual and azimuth are taken together. Its sums over small voxels are accumulated
+       along the three axes (a summed-area table; Crow 1984), once for all of these copies.
+    2. The faces of the stand's voxels are moved to the coordinates of the individual. The table, linear
+       between its nodes, is interpolated at their corners, and its differences are the amounts of a copy in
+       the voxels.
+    """
     size = voxel_edges(voxel_size)
     check_choice("wood", wood, ("volume", "surface"))
-    if leaf_area is not None:
-        check_number("leaf_area", leaf_area, 0.0)
     samples, offsets = check_integer("samples", samples), check_integer("offsets", offsets)
     azimuths = check_integer("azimuths", azimuths)
-    check_range("position", position)
-    place = np.asarray(position, float)
-    if place.ndim != 2 or place.shape[1] != 3 or len(place) == 0:
-        raise ValueError(f"position has shape {place.shape}; admissible is (n, 3), with one copy or more")
-    if not trees:
-        raise ValueError("individuals is empty; at least one tree is admissible")
-    number, turn = np.zeros(len(place), int), np.zeros(len(place))
-    if individual is not None:
-        check_range("individual", individual, 0, len(trees) - 1)
-        number = np.asarray(individual)
-        if not np.issubdtype(number.dtype, np.integer):
-            raise TypeError(f"individual is an array of {number.dtype}; admissible are integers")
-    if azimuth is not None:
-        check_range("azimuth", azimuth)
-        turn = np.asarray(azimuth, float)
-    for name, array in (("individual", number), ("azimuth", turn)):
-        check_shape(name, array, (len(place),))
-    has_wood, has_leaf = np.any([_has_material(tree) for tree in trees], axis=0).tolist()
+    step = np.round(stand.azimuth / 360.0 * azimuths).astype(int) % azimuths
+    material = np.array([_has_material(tree) for tree in stand.individuals])[stand.individual]
+    has_wood, has_leaf = bool(np.any(material[:, 0])), bool(np.any(material[:, 1]))
     if not has_wood and not has_leaf:
         raise ValueError("individuals have neither wood nor clumps; there is nothing to voxelise")
-
-    # Distances in fine voxels from the origin of coordinates, whole numbers.
-    fine = size / offsets
-    node = np.round(place / fine).astype(np.int64)
-    step = np.round(turn / 360.0 * azimuths).astype(int) % azimuths
-    patterns: dict[tuple[int, int], tuple[np.ndarray, _MaterialSums]] = {}
-    for k, m in sorted(set(zip(number.tolist(), step.tolist()))):
-        if not any(_has_material(trees[k])):
-            continue
-        tree = trees[k].translated(-trees[k].base).rotated(360.0 * m / azimuths)
-        grid = Grid.enclosing(*_bounding_box(tree), fine, None, None)
-        first = np.round(grid.low / fine).astype(np.int64)
-        patterns[k, m] = first, _sum_material(tree, grid, leaf_area, wood, -(-samples // offsets))
-    corners = [
-        (node[c] + patterns[key][0], patterns[key][1].leaf.shape)
-        for c, key in _copies(number, step, patterns)
-    ]
-    if not corners:
-        raise ValueError("individual: no copy has wood or clumps; there is nothing to voxelise")
-    low = np.min([corner // offsets for corner, _ in corners], axis=0)
-    high = np.max([-(-(corner + shape) // offsets) for corner, shape in corners], axis=0)
-    stand = Grid(low * size, size, tuple((high - low).tolist()))
-    sums = _MaterialSums(stand.zeros(), stand.zeros(), stand.zeros())
-    # Sums of fine voxels by pattern and position within a voxel: few of them, used by many copies.
-    coarse: dict[tuple, _MaterialSums] = {}
-    for n_copies, (c, key) in enumerate(_copies(number, step, patterns), 1):
-        first, fine_sums = patterns[key]
-        voxel, offset = np.divmod(node[c] + first, offsets)
-        if (block := coarse.get((key, *offset.tolist()))) is None:
-            block = _MaterialSums(*(_sum_blocks(a, offset, offsets) for a in fine_sums))
-            coarse[(key, *offset.tolist())] = block
-        start = voxel - low
-        target = tuple(slice(i, i + n) for i, n in zip(start.tolist(), block.leaf.shape))
-        for total, amounts in zip(sums, block):
-            total[target] += amounts
-        if progress is not None:
-            progress(n_copies, len(place))
-    return _voxel_map(stand, sums, (has_wood, has_leaf), leaf_area, wood)
-
-
-def _copies(
-    number: np.ndarray, step: np.ndarray, patterns: Mapping[tuple[int, int], Any]
-) -> Iterator[tuple[int, tuple[int, int]]]:
-    """Yield each copy that has material, and the key of its pattern: its individual and its azimuth."""
-    for copy, key in enumerate(zip(number.tolist(), step.tolist())):
-        if key in patterns:
-            yield copy, key
+    patterns: dict[tuple[int, int], list[int]] = {}
+    for copy in np.flatnonzero(material.any(axis=1)).tolist():
+        patterns.setdefault((int(stand.individual[copy]), int(step[copy])), []).append(copy)
+    turned = {(k, m): stand.individuals[k].rotated(360.0 * m / azimuths) for k, m in patterns}
+    # Stretching moves the box around the axes of the wood; radii and clumps around them stretch differently.
+    low, high = np.full(3, np.inf), np.full(3, -np.inf)
+    for key, copies in patterns.items():
+        box = np.stack(_bounding_box(turned[key]))
+        ends = stand.position[copies, None] + stand.scale[copies][:, None, [0, 0, 1]] * box
+        low, high = np.minimum(low, ends[:, 0].min(axis=0)), np.maximum(high, ends[:, 1].max(axis=0))
+    grid = Grid.enclosing(low, high, size, origin, shape)
+    sums = _MaterialSums(grid.zeros(), grid.zeros(), grid.zeros())
+    n_copies = 0
+    for key, copies in patterns.items():
+        fine = Grid.enclosing(*_bounding_box(turned[key]), size / offsets, None, None)
+        # Of one m2 in each clump, where the areas are given.
+        unit_area = None if leaf_area is None else 1.0
+        amounts = _sum_material(turned[key], fine, unit_area, wood, -(-samples // offsets))
+        tables = [_summed_area_table(a) for a in amounts]
+        factors = _amount_factors(stand, key[0], copies, leaf_area)
+        for copy, amount_factors in zip(copies, factors):
+            stretch = stand.scale[copy, [0, 0, 1]]
+            # The coarse grid in small voxels of the individual: its corner and its voxels.
+            corner = ((grid.low - stand.position[copy]) / stretch - fine.low) / fine.size
+            faces = [
+                _faces_within(*of_axis) for of_axis in zip(corner, offsets / stretch, fine.shape, grid.shape)
+            ]
+            target = tuple(slice(first, first + len(t) - 1) for first, t in faces)
+            for total, table, factor in zip(sums, tables, amount_factors):
+                if factor > 0.0 and table[-1, -1, -1] > 0.0:
+                    total[target] += factor * _box_sums(table, [t for _, t in faces])
+            n_copies += 1
+            if progress is not None:
+                progress(n_copies, len(stand))
+    if progress is not None and n_copies < len(stand):
+        # Copies without material took no time.
+        progress(len(stand), len(stand))
+    return _voxel_map(grid, sums, (has_wood, has_leaf), None if leaf_area is None else 1.0, wood)
 
 
-def _sum_blocks(fine: np.ndarray, offset: np.ndarray, factor: int) -> np.ndarray:
-    """Sum fine voxels in voxels `factor` times as large; they begin `offset` fine voxels into the first."""
-    padding = [(int(o), int(-(o + n) % factor)) for o, n in zip(offset, fine.shape)]
-    padded = np.pad(fine, padding)
-    nx, ny, nz = (n // factor for n in padded.shape)
-    return padded.reshape(nx, factor, ny, factor, nz, factor).sum(axis=(1, 3, 5))
+def _summed_area_table(amounts: np.ndarray) -> np.ndarray:
+    """Return the sums of all voxels below each node: zeros at the lower sides, then cumulative sums."""
+    return np.pad(amounts, ((1, 0), (1, 0), (1, 0))).cumsum(axis=0).cumsum(axis=1).cumsum(axis=2)
+
+
+def _faces_within(corner: float, step: float, n_small: int, n_voxels: int) -> tuple[int, np.ndarray]:
+    """Return the first voxel that small voxels reach, and the faces of all that they reach.
+
+    The faces of n voxels are at corner + step * k, k = 0 ... n, in small voxels, of which there are
+    `n_small`. What lies beyond the grid counts in its outermost voxels.
+    """
+    first = int(np.clip(np.floor(-corner / step + _FACE_TOLERANCE), 0, n_voxels - 1))
+    last = int(np.clip(np.ceil((n_small - corner) / step - _FACE_TOLERANCE), first + 1, n_voxels))
+    faces = np.clip(corner + step * np.arange(first, last + 1), 0.0, n_small)
+    # Faces that coincide with those of small voxels may differ from them by rounding.
+    whole = np.round(faces)
+    faces = np.where(np.abs(faces - whole) < _FACE_TOLERANCE * step, whole, faces)
+    faces[0], faces[-1] = 0.0, n_small
+    return first, faces
+
+
+def _box_sums(table: np.ndarray, faces: Sequence[np.ndarray]) -> np.ndarray:
+    """Return the sums in the boxes between faces. Small voxels that a face cuts count in proportion."""
+    total = table[-1, -1, -1]
+    for axis, t in enumerate(faces):
+        node = np.minimum(np.floor(t).astype(int), table.shape[axis] - 2)
+        weight = np.expand_dims(t - node, tuple(k for k in range(3) if k != axis))
+        table = (1.0 - weight) * table.take(node, axis) + weight * table.take(node + 1, axis)
+    sums = np.diff(np.diff(np.diff(table, axis=0), axis=1), axis=2)
+    # Differences of equal sums are zero but for rounding.
+    return np.where(sums > 1e-12 * total, sums, 0.0)
+
+
+def _amount_factors(
+    stand: Stand, k: int, copies: list[int], leaf_area: Float[np.ndarray, " n"] | None
+) -> np.ndarray:
+    """Return (copies, 3) factors of copies of individual k on its volume and side area of wood, and leaf."""
+    tree, scale = stand.individuals[k], stand.scale[copies]
+    a, b = tree.radius_start, tree.radius_end
+    run, rise = np.hypot(*(tree.end - tree.start).T[:2]), np.abs((tree.end - tree.start)[:, 2])
+    volume, side = a * a + a * b + b * b, a + b
+    factors = np.ones((len(copies), 3))
+    for row, (horizontal, vertical, radial) in enumerate(scale):
+        length = np.hypot(horizontal * run, vertical * rise)
+        if len(a):
+            factors[row, 0] = radial**2 * np.sum(volume * length) / np.sum(volume * tree.length)
+            slant = np.hypot(length, radial * (a - b)) / np.sum(side * np.hypot(tree.length, a - b))
+            factors[row, 1] = radial * np.sum(side * slant)
+    is_area = leaf_area is not None
+    factors[:, 2] = leaf_area[copies] if is_area else scale[:, 0] ** 2 * scale[:, 1]
+    return factors
 
 
 def voxelise_points(

@@ -61,6 +61,18 @@ class RunningMoments(NamedTuple):
 
         return RunningMoments(jnp.zeros((), jnp.int32), zeros(like), zeros(like), zeros(mean_only_like))
 
+    @staticmethod
+    def of_batches(values: Any, mean_only: Any = ()) -> "RunningMoments":
+        """Return the moments of batches that lie along axis 0 of arrays, within a compiled program."""
+
+        def mean_of(tree: Any) -> Any:
+            return jax.tree.map(lambda a: jnp.mean(a, axis=0), tree)
+
+        mean = mean_of(values)
+        squares = jax.tree.map(lambda a, m: jnp.sum((a - m[None]) ** 2, axis=0), values, mean)
+        count = jnp.asarray(jax.tree.leaves(values)[0].shape[0], jnp.int32)
+        return RunningMoments(count, mean, squares, mean_of(mean_only))
+
     def update(self, value: Any, mean_only: Any = ()) -> "RunningMoments":
         """Return the moments with one more batch. On the host, those before it are overwritten."""
         count = self.count + 1

@@ -55,8 +55,9 @@ class PulseConvolution(eqx.Module):
     def matrix(self) -> Float[Array, "fine samples"]:
         """Return the fraction of a return in fine bin i that each sample receives."""
         samples, bins = np.arange(self.n_samples)[None, :], np.arange(self.n_bins)[:, None]
-        # Optimisation barrier: fused into the gather, the pulse would be computed again for every element.
-        return once(self.fractions)[samples * self.bins_per_sample - bins - self.first_offset]
+        # Optimisation barriers: fused into the gather, the pulse would be computed again for every element;
+        # and the matrix for every product, in place of once for all shots of a survey.
+        return once(once(self.fractions)[samples * self.bins_per_sample - bins - self.first_offset])
 
     def __call__(self, fine: Float[Array, "*s bins"]) -> Float[Array, "*s samples"]:
         """Return the samples of returns in fine bins."""

@@ -18,7 +18,8 @@ one of two ways:
 """
 
 import dataclasses
-from collections.abc import Callable, Iterator, Mapping
+import math
+from collections.abc import Iterator, Mapping
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -43,6 +44,7 @@ from jaxlidar.spectral.apply_optics import (
     component_samples,
     make_waveform_model,
     relative_energy_samples,
+    total_samples,
 )
 from jaxlidar.survey.results import ShotErrors, ShotResults, make_shot_results
 from jaxlidar.survey.strategy import AbstractStrategy, slices_of_shots
@@ -54,6 +56,8 @@ from jaxlidar.trace.response import Response, trace_device_scene, trace_first_on
 _CHUNK_FIRST_ORDER, _CHUNK_HIGHER_ORDERS = 128, 16
 # Largest number of batches of a shot, or of parts of a lattice: a tolerance that is out of reach ends here.
 MAX_BATCHES_OR_PARTS = 1024
+# Rays that are marched side by side: more would not fit into a processor's cache.
+_RAYS_SIDE_BY_SIDE = 512
 # Batches of a shot follow one another, so that steps could be as small as one. The error is looked at after
 # every fourth: an estimate that stops at the first moment at which it seems precise is wrong more often.
 _BATCH_STEPS = StepRule(max_growth=1.0, min_step=4)
@@ -161,45 +165,20 @@ def trace_chunk(setup: Setup, shots: ShotGeometry, rtol: float, key: PRNGKeyArra
 
 
 class ShotBatch(NamedTuple):
-    """Samples by component and of the relative energy, and the energy budget, of one batch of a shot."""
+    """Samples by component and of the relative energy, and the energy budget, of a shot."""
 
     components: dict[str, Float[Array, "wavelengths samples"]]
     relative_energy: Float[Array, "wavelengths samples"]
     budget: BudgetTerms
 
-
-def _with_errors(batch: ShotBatch) -> tuple[Array, dict[str, Array]]:
-    """Return the quantities whose standard errors are reported: the waveform and the energy budget."""
-    return batch.components["first"] + batch.components["higher"], batch.budget.energy_budget
-
-
-# Its shapes are needed as well as its values: within `filter_jit`, JAX evaluates the function once for both.
-@eqx.filter_jit
-def _trace_lattice_part(scene: DeviceScene, key: PRNGKeyArray, ray_slice: RaySlice) -> Response:
-    """Return the response of a part of the rays of a lattice."""
-    return trace_first_only(scene, key, ray_slice)
-
-
-@eqx.filter_jit
-def _trace_batch(scene: DeviceScene, model: WaveformModel, key: PRNGKeyArray, n_parts: Array) -> ShotBatch:
-    """Trace one batch. `n_parts`: number of parts of its lattice, where only the first order is traced."""
-    if scene.config.follows_higher_orders:
-        response = trace_device_scene(scene, key)
-    else:
-
-        def add_part(number: Array, response_sum: Response) -> Response:
-            response = _trace_lattice_part(scene, key, RaySlice(number, n_parts))
-            return jax.tree.map(jnp.add, response_sum, response)
-
-        shapes = jax.eval_shape(_trace_lattice_part, scene, key, RaySlice(n_parts, n_parts))
-        response_sum = jax.lax.fori_loop(0, n_parts, add_part, _zeros(shapes))
-        # Every part has the energy of the complete beam: the lattice is their mean.
-        response = jax.tree.map(lambda a: a / n_parts, response_sum)
-    return ShotBatch(
-        component_samples(response, model),
-        relative_energy_samples(response, model),
-        budget_terms(response, model),
-    )
+    @staticmethod
+    def of_response(response: Response, model: WaveformModel) -> "ShotBatch":
+        """Apply optics, atmosphere and pulse to a response."""
+        return ShotBatch(
+            component_samples(response, model),
+            relative_energy_samples(response, model),
+            budget_terms(response, model),
+        )
 
 
 def _trace_shot(
@@ -215,27 +194,26 @@ def _trace_shot(
     # The key follows from the shot's number: its waveform does not depend on chunks or workers.
     setup, key = setup_of_shot(setup, shot), jax.random.fold_in(key, shot.number)
     scene, model = aim_at(scene, setup.lidar, offset), make_waveform_model(setup)
-
-    def trace_batch(number: Array, n_parts: Array) -> ShotBatch:
-        batch_key = jax.random.fold_in(key, number)
-        return _trace_batch(scene, model, batch_key, n_parts)
-
-    zero, undivided = jnp.zeros((), jnp.int32), jnp.ones((), jnp.int32)
     if not setup.plan.is_random:
-        batch = trace_batch(zero, undivided)
-        waveform, energy_budget = jax.tree.map(jnp.zeros_like, _with_errors(batch))
-        errors = ShotErrors(waveform, energy_budget, jnp.zeros(()))
-        return make_shot_results(
-            model, batch.components, batch.relative_energy, batch.budget, errors, photons=zero
-        )
+        batch = ShotBatch.of_response(trace_device_scene(scene, key), model)
+        errors = jax.tree.map(jnp.zeros_like, _with_errors(batch))
+        return _shot_results(model, batch, ShotErrors(*errors, jnp.zeros(())), jnp.zeros((), jnp.int32))
 
     refine = _add_batches if scene.config.follows_higher_orders else _densify_lattices
-    estimate = refine(trace_batch, jax.eval_shape(trace_batch, zero, undivided), rtol)
-    mean: ShotBatch = estimate.mean_only
-    waveform_stderr, energy_budget_stderr = estimate.stderr
-    errors = ShotErrors(waveform_stderr, energy_budget_stderr, _relative_error(estimate))
-    photons = estimate.count * setup.plan.photons_traced
-    return make_shot_results(model, mean.components, mean.relative_energy, mean.budget, errors, photons)
+    estimate = refine(scene, model, key, rtol)
+    errors = ShotErrors(*estimate.stderr, _relative_error(estimate))
+    return _shot_results(model, estimate.mean_only, errors, estimate.count * setup.plan.photons_traced)
+
+
+def _shot_results(model: WaveformModel, batch: ShotBatch, errors: ShotErrors, photons: Array) -> ShotResults:
+    return make_shot_results(
+        model, batch.components, batch.relative_energy, batch.budget, errors, photons=photons
+    )
+
+
+def _with_errors(batch: ShotBatch) -> tuple[Array, dict[str, Array]]:
+    """Return the quantities whose standard errors are reported: the waveform and the energy budget."""
+    return batch.components["first"] + batch.components["higher"], batch.budget.energy_budget
 
 
 def _relative_error(estimate: RunningMoments) -> Array:
@@ -243,43 +221,77 @@ def _relative_error(estimate: RunningMoments) -> Array:
     return relative_error(estimate.mean[0], estimate.stderr[0])
 
 
-def _no_batches(shapes: ShotBatch) -> RunningMoments:
-    """Return the moments of no batch, for batches of these shapes."""
-    return RunningMoments.in_program(_with_errors(_zeros(shapes)), shapes)
-
-
-def _add_batches(
-    trace_batch: Callable[[Array, Array], ShotBatch], shapes: ShotBatch, rtol: Array
-) -> RunningMoments:
+def _add_batches(scene: DeviceScene, model: WaveformModel, key: PRNGKeyArray, rtol: Array) -> RunningMoments:
     """Trace batch after batch until the error is below the tolerance."""
-    undivided = jnp.ones((), jnp.int32)
+
+    @eqx.filter_jit
+    def trace_batch(number: Array) -> ShotBatch:
+        return ShotBatch.of_response(trace_device_scene(scene, jax.random.fold_in(key, number)), model)
 
     def add_batch(number: Array, estimate: RunningMoments) -> RunningMoments:
-        batch = trace_batch(number, undivided)
+        batch = trace_batch(number)
         return estimate.update(_with_errors(batch), batch)
 
     def refine(estimate: RunningMoments, size: Array, next_size: Array) -> RunningMoments:
         return jax.lax.fori_loop(size, next_size, add_batch, estimate)
 
+    shapes = jax.eval_shape(trace_batch, jnp.zeros((), jnp.int32))
+    no_batches = RunningMoments.in_program(_with_errors(_zeros(shapes)), shapes)
     stop = StoppingRule(rtol, min_size=MIN_BATCHES, max_size=MAX_BATCHES_OR_PARTS)
-    return sample_until_compiled(refine, _no_batches(shapes), _relative_error, stop, _BATCH_STEPS)
+    return sample_until_compiled(refine, no_batches, _relative_error, stop, _BATCH_STEPS)
 
 
 def _densify_lattices(
-    trace_batch: Callable[[Array, Array], ShotBatch], shapes: ShotBatch, rtol: Array
+    scene: DeviceScene, model: WaveformModel, key: PRNGKeyArray, rtol: Array
 ) -> RunningMoments:
-    """Trace eight batches, again with lattices of more parts until the error is below the tolerance."""
+    """Trace eight lattices, again with more parts, until the error is below the tolerance.
+
+    1. Trace the lattices. Where each has few rays, several are marched side by side: a step costs about as
+       much for a few rays as for hundreds.
+    2. Apply optics and pulse to each of them, but in its sum over materials alone: that is what their scatter
+       is needed for.
+    3. When the tolerance is met, apply them to the mean of the responses, component by component.
+    """
+    side_by_side = math.gcd(MIN_BATCHES, max(_RAYS_SIDE_BY_SIDE // scene.config.n_rays, 1))
+
+    def trace_lattice(number: Array, n_parts: Array) -> tuple[tuple[Array, dict[str, Array]], Response]:
+        response = _trace_lattice(scene, jax.random.fold_in(key, number), n_parts)
+        return (total_samples(response, model), budget_terms(response, model).energy_budget), response
 
     def refine(coarser: RunningMoments, n_parts: Array, next_n_parts: Array) -> RunningMoments:
         # The coarser estimate is dropped: a standard error is the scatter of batches of one kind.
-        def add_batch(number: Array, estimate: RunningMoments) -> RunningMoments:
-            batch = trace_batch(number, next_n_parts)
-            return estimate.update(_with_errors(batch), batch)
+        def add_lattices(group: Array, estimate: RunningMoments) -> RunningMoments:
+            numbers = group * side_by_side + jnp.arange(side_by_side, dtype=jnp.int32)
+            lattices = jax.vmap(trace_lattice, (0, None))(numbers, next_n_parts)
+            return estimate.merge(RunningMoments.of_batches(*lattices))
 
-        return jax.lax.fori_loop(0, MIN_BATCHES, add_batch, _no_batches(shapes))
+        return jax.lax.fori_loop(0, MIN_BATCHES // side_by_side, add_lattices, no_lattices)
 
+    one = jnp.ones((), jnp.int32)
+    no_lattices = RunningMoments.in_program(*jax.eval_shape(trace_lattice, one, one))
     stop = StoppingRule(rtol, min_size=1, max_size=MAX_BATCHES_OR_PARTS)
-    return sample_until_compiled(refine, _no_batches(shapes), _relative_error, stop, _LATTICE_STEPS)
+    estimate = sample_until_compiled(refine, no_lattices, _relative_error, stop, _LATTICE_STEPS)
+    return estimate._replace(mean_only=ShotBatch.of_response(estimate.mean_only, model))
+
+
+# Its shapes are needed as well as its values: within `filter_jit`, JAX evaluates the function once for both.
+@eqx.filter_jit
+def _trace_lattice_part(scene: DeviceScene, key: PRNGKeyArray, ray_slice: RaySlice) -> Response:
+    """Return the response of a part of the rays of a lattice."""
+    return trace_first_only(scene, key, ray_slice)
+
+
+def _trace_lattice(scene: DeviceScene, key: PRNGKeyArray, n_parts: Array) -> Response:
+    """Return the response of a lattice of rays, which is traced in parts."""
+
+    def add_part(number: Array, response_sum: Response) -> Response:
+        response = _trace_lattice_part(scene, key, RaySlice(number, n_parts))
+        return jax.tree.map(jnp.add, response_sum, response)
+
+    shapes = jax.eval_shape(_trace_lattice_part, scene, key, RaySlice(n_parts, n_parts))
+    response_sum = jax.lax.fori_loop(0, n_parts, add_part, _zeros(shapes))
+    # Every part has the energy of the complete beam: the lattice is their mean.
+    return jax.tree.map(lambda a: a / n_parts, response_sum)
 
 
 def _zeros(shapes: Any) -> Any:

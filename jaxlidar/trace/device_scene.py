@@ -64,7 +64,8 @@ class DeviceScene(eqx.Module):
     - `meshes`: the triangles of all meshes; None without any.
     - `laws`: the laws by which photons are sent on; `surface_laws`, `leaf_law`, `bark_law` are indices of
       these.
-    - `depth_above`: optical depth straight up from every voxel's upper face, for a beam at nadir; else None.
+    - `depth_above`: optical depth straight up from every voxel's upper face, for photons of a beam at nadir;
+      else None.
     - `occupied_box`: the block of the grid that holds all voxels with any extinction.
 
     The plan:
@@ -244,12 +245,17 @@ def _build_geometry(
     surfaces = traced_surfaces(scene, aim)
     meshes = build_mesh_tree(scene.meshes, scene.period).moved(-aim) if scene.meshes else None
     surface_laws = tuple(law_number(s.law) for s in surfaces)
+    # Rays of the first order sum their depths on their way down. A table that nothing reads is not free: its
+    # cotangent is a sum of zeros over the map, which XLA evaluates for seconds while it compiles.
+    depth_above = None
+    if medium is not None and config.vertical and config.follows_higher_orders:
+        depth_above = vertical_depths(medium)
     return DeviceScene(
         beam=make_beam(lidar),
         medium=medium,
         surfaces=surfaces,
         laws=tuple(laws),
-        depth_above=None if medium is None or not config.vertical else vertical_depths(medium),
+        depth_above=depth_above,
         occupied_box=None if medium is None else occupied_box(medium),
         next_history=jnp.asarray(histories(len(config.channels), config.degree).next_history),
         limits=limits,

@@ -42,6 +42,11 @@ def small_trajectory() -> bytes:
     return b"GPSTime,Easting,Northing,Height,Roll,Pitch,Heading\n" + b"".join(rows)
 
 
+def small_inventory() -> bytes:
+    rows = (b"beech,%d.5,1%d,2%d.1,0.%d5,%d,\n" % (i, i, i, i, i + 3) for i in range(8))
+    return b"species,x,y,height,dbh,crown,remarks\n" + b"".join(rows)
+
+
 def small_obj() -> bytes:
     from tests.plants.test_meshes import OBJ
 
@@ -227,6 +232,10 @@ def plausible_trajectory(result: Any) -> bool:
     return finite(result.time, result.position, *angles) and bool(np.all(np.diff(result.time) > 0))
 
 
+def plausible_inventory(result: Any) -> bool:
+    return finite(result.x, result.y, result.height) and bool(np.all(result.height > 0))
+
+
 def plausible_spectrum(result: Any) -> bool:
     rho, wavelength = np.asarray(result.reflectance), np.asarray(result.wavelength)
     rising = np.all(np.diff(wavelength) > 0)
@@ -357,6 +366,7 @@ KINDS = {
     "obj": text_kind("read_obj", ".obj", small_obj, plausible_mesh),
     "qsm": text_kind("read_qsm", ".csv", small_qsm, plausible_tree, "voxels/tree_qsm.csv"),
     "trajectory": text_kind("read_trajectory", ".csv", small_trajectory, plausible_trajectory),
+    "inventory": text_kind("read_inventory", ".csv", small_inventory, plausible_inventory),
     "grid": text_kind("read_dem", ".asc", small_grid, plausible_terrain, place=rf"{LINE}|.* x = .*, y = "),
     "tiff": FileKind("binary", "read_dem", ".tif", (small_tiff,), change_bytes, plausible_terrain),
     "spectrum": text_kind("read_spectrum_csv", ".csv", small_spectrum, plausible_spectrum),

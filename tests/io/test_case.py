@@ -148,7 +148,7 @@ def test_every_class_has_an_example():
     classes = {name for name, kind in kinds().items() if isinstance(kind, type)}
     # No lidar, survey or scene holds one of these: they make trees, surveys and the shapes of surfaces.
     plants, scan_patterns = (
-        {"Habit", "Branching"},
+        {"Habit", "Branching", "Stand"},
         {"Oscillating", "RotatingPolygon", "Conical", "Trajectory"},
     )
     # Their arrays of whole numbers have tests of their own, in tests/scenes/test_mesh_surface.py.
@@ -170,7 +170,19 @@ def test_every_quantity_has_a_unit_or_is_a_pure_number():
     pure |= {"reflectance", "transmittance", "scale", "power", "index", "absorption", "leaf_angles", "fill"}
     pure |= {"rtol", "atol", "n_photons", "n_rays", "lad", "upward", "foot", "a", "b"}
     pure |= {"detection_probability", "flight_line"}
-    pure |= {"density", "shares", "size", "share", "exponent", "length_exponent", "bole", "twig", "beams"}
+    pure |= {
+        "leaf_area_index",
+        "wood_probability",
+        "density",
+        "shares",
+        "size",
+        "share",
+        "exponent",
+        "length_exponent",
+        "bole",
+        "twig",
+        "beams",
+    }
     for name, kind in kinds().items():
         for argument in numeric_arguments(kind):
             has_unit = argument in UNITS or (kind, argument) in UNITS_OF
@@ -200,6 +212,7 @@ def test_example_cases_can_be_read_and_planned(path, tmp_path):
     text = path.read_text()
     if "voxelise" in text:
         # Coarser voxels, for speed.
+        shutil.copytree(path.parent, tmp_path, dirs_exist_ok=True)
         (tmp_path / path.name).write_text(text.replace("voxel_size = 0.25", "voxel_size = 2.0"))
         path = tmp_path / path.name
     case = jl.io.read_case(path)

@@ -52,6 +52,23 @@ def test_compiled_moments_are_those_on_the_host(precision):
     np.testing.assert_allclose(moments.stderr, exact_stderr(np.asarray(batches, float)), **close)
 
 
+def test_moments_of_batches_side_by_side_are_those_of_one_after_the_other():
+    batches = jnp.asarray(BATCHES - 1e3)
+
+    @jax.jit
+    def compiled(batches):
+        empty = RunningMoments.in_program(batches[0], 2.0 * batches[0])
+        side_by_side = [RunningMoments.of_batches(part, 2.0 * part) for part in (batches[:12], batches[12:])]
+        # Of no batch and of twelve: as where the first group is added.
+        return empty.merge(side_by_side[0]).merge(side_by_side[1])
+
+    moments = compiled(batches)
+    assert int(moments.count) == len(BATCHES)
+    np.testing.assert_allclose(moments.mean, np.mean(BATCHES - 1e3, axis=0), rtol=1e-4, atol=1e-6)
+    np.testing.assert_allclose(moments.mean_only, 2.0 * moments.mean, rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(moments.stderr, exact_stderr(BATCHES - 1e3), rtol=1e-4)
+
+
 @pytest.mark.parametrize("cut", [1, 8, 19])
 def test_merged_moments_are_those_of_all_batches(cut):
     merged, moments = on_host(BATCHES[:cut]).merge(on_host(BATCHES[cut:])), on_host(BATCHES)

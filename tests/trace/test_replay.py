@@ -12,6 +12,7 @@ import pytest
 
 import jaxlidar as jl
 from jaxlidar.trace import replay
+from jaxlidar.trace.device_scene import build_device_scene
 from tests.helpers import agrees
 
 RANDOM = np.random.default_rng(0)
@@ -220,3 +221,14 @@ def test_gradients_in_voxels_agree_with_differences(orders):
     assert agrees(mean, stderr, expected, sigmas=3.5)
     # Planted: a derivative of the wrong sign.
     assert not agrees(-mean, stderr, expected, sigmas=3.5)
+
+
+def test_first_order_alone_has_no_table_of_vertical_depths():
+    """The cotangent of a table that is not read is a sum of zeros, which XLA takes seconds to evaluate."""
+    scene, lidar = leaves_over_ground(START), jl.Lidar(divergence=2.0)
+    is_built = []
+    for orders in (1, 2):
+        plan = jl.plan(lidar, scene, max_orders=orders, n_rays=16, n_photons=16)
+        device_scene = build_device_scene(jl.make_setup(lidar, scene, plan), derivatives="all")
+        is_built.append(device_scene.depth_above is not None)
+    assert is_built == [False, True]

@@ -1,0 +1,300 @@
+"""Stands from forest inventories: tables with a row for each tree."""
+
+import re
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxlidar._checks import check_integer, check_kind, check_seed, kind_of
+from jaxlidar.plants.forest import MAX_TREE_HEIGHT
+from jaxlidar.plants.habits import Habit, broadleaf, conifer, grow, shrub, spreading_tree
+from jaxlidar.plants.stand import Stand
+from jaxlidar.plants.tree import Tree
+
+# Names of columns, without case, spaces, underscores and units.
+_NAMES = {
+    "x": ("x", "easting", "east", "e"),
+    "y": ("y", "northing", "north", "n"),
+    "height": ("height", "treeheight", "totalheight", "h", "ht"),
+    "z": ("z", "elevation", "groundelevation"),
+    "diameter": ("diameter", "dbh", "d", "bhd", "stemdiameter", "trunkdiameter"),
+    "crown": ("crown", "crowndiameter", "crownwidth", "cd"),
+    "leaf_area": ("leafarea", "la"),
+    "species": ("species", "sp", "speciesname"),
+}
+_REQUIRED = ("x", "y", "height")
+# Quantities of a tree that may be missing: the proportions of the habit give them.
+_OPTIONAL_CELLS = ("diameter", "crown")
+# Admissible values, (low, high], in m or m2; low belongs to those of leaf area and coordinates.
+_LIMITS = {
+    "x": (-1e9, 1e9),
+    "y": (-1e9, 1e9),
+    "z": (-1e9, 1e9),
+    "height": (0.0, MAX_TREE_HEIGHT),
+    "diameter": (0.0, 15.0),
+    "crown": (0.0, 100.0),
+    "leaf_area": (0.0, 1e5),
+}
+# No tree is thicker than this fraction of its height: such diameters are in centimetres.
+_MAX_SLENDERNESS = 0.5
+_UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "ft": 0.3048}
+# A name, and a unit in brackets or after an underscore.
+_NAME_AND_UNIT = re.compile(r"\s*(.*?)\s*(?:[\[(]\s*([^\])]*?)\s*[\])]|_(m|cm|mm|ft|m2))?\s*$")
+
+
+class Inventory(NamedTuple):
+    """Trees of a forest inventory: one element for each tree.
+
+    - `x`, `y`: (n,) positions of the stems, m.
+    - `height`: (n,) m.
+    - `species`: n names; None where the table has none.
+    - `z`: (n,) heights of the stem bases, m; None where the table has none.
+    - `diameter`, `crown`: (n,) diameters of stem and crown, m, NaN where they were not measured; None where
+      the table has none.
+    - `leaf_area`: (n,) one-sided leaf areas of the trees, m2; None where the table has none.
+
+    **Example:**
+
+    >>> import numpy as np, jaxlidar as jl
+    >>> inventory = jl.Inventory(np.array([1.0, 4.0]), np.array([2.0, 2.0]), np.array([12.0, 15.5]))
+    >>> print(f"{inventory.height.max()} m, crowns: {inventory.crown}")
+    15.5 m, crowns: None
+    """
+
+    x: Float[np.ndarray, " n"]
+    y: Float[np.ndarray, " n"]
+    height: Float[np.ndarray, " n"]
+    species: tuple[str, ...] | None = None
+    z: Float[np.ndarray, " n"] | None = None
+    diameter: Float[np.ndarray, " n"] | None = None
+    crown: Float[np.ndarray, " n"] | None = None
+    leaf_area: Float[np.ndarray, " n"] | None = None
+
+
+def stand_from_inventory(
+    inventory: Inventory | Mapping[str, Sequence] | Any,
+    habits: Habit | Mapping[str, Habit] | None = None,
+    *,
+    leaf_area_index: float | None = None,
+    area: float | None = None,
+    individuals: int = 8,
+    seed: int | np.random.Generator = 0,
+) -> Stand:
+    """Make a stand of the trees of a forest inventory.
+
+    Every tree stands at its place and has the height, stem diameter and crown diameter of the table, as far
+    as the table has them: it is a copy of an individual of its habit, scaled along these. What a tree lacks
+    has the proportions of the individual. Azimuths are random.
+
+    **Arguments:**
+
+    - `inventory`: an `Inventory`, such as `jaxlidar.io.read_inventory` returns; or a table by columns, such
+      as a dict of lists or a pandas DataFrame. It has columns x, y and height, and may have species, z,
+      diameter (also dbh), crown (crown diameter) and leaf_area, under these names in any case. Lengths are in
+      m, or in the unit that the name of the column ends with, as in "dbh [cm]" or "dbh_cm"; leaf areas in m2.
+      Diameters and crowns may be NaN. Other columns are not read.
+    - `habits`: the habit of each species by name, or one `Habit` for all. Default None: the species
+      broadleaf, conifer, shrub and spreading_tree; without a column of species, `broadleaf()`.
+    - `leaf_area_index`: one-sided leaf area per ground area, 0 or more, which is divided among the trees by
+      the areas of their crowns. Default None: the leaf areas of the table, if it has them; otherwise the
+      stand states none.
+    - `area`: ground area of `leaf_area_index`, m2, positive. Give both or neither. Default None.
+    - `individuals`: number of different trees that are grown of each habit, 1 or more. Default 8.
+    - `seed`: random seed, or a NumPy generator. Default 0.
+
+    **Returns:** a `Stand`, in the order of the rows. `Stand.above` puts it on a terrain.
+
+    **Raises:** ValueError, naming row (from 0) and column, for cells that are no numbers or outside their
+    range, for stems thicker than half the tree's height, and for species without a habit; for columns that
+    are missing or ambiguous; for a leaf area index beside leaf areas, or without an area. TypeError for
+    objects of another kind.
+
+    **Example:**
+
+    >>> import jaxlidar as jl
+    >>> rows = {"species": ["hazel", "hazel"], "x": [2.0, 6.5], "y": [3.0, 4.0], "height": [2.0, 2.6]}
+    >>> rows |= {"crown": [1.5, 2.0], "dbh [cm]": [4.0, 5.5]}
+    >>> stand = jl.stand_from_inventory(rows, {"hazel": jl.shrub(stems=2)}, individuals=1)
+    >>> [f"{tree.height:.1f} m at {tree.base[0]:.1f}" for tree in stand]
+    ['2.0 m at 2.0', '2.6 m at 6.5']
+    """
+    trees = inventory if isinstance(inventory, Inventory) else inventory_of_table(inventory)
+    if isinstance(inventory, Inventory):
+        # Checked as any other table.
+        present = {name: column for name, column in inventory._asdict().items() if column is not None}
+        trees = inventory_of_table(present)
+    if (leaf_area_index is None) != (area is None):
+        raise ValueError("leaf_area_index and area belong together: give both or neither")
+    if leaf_area_index is not None and trees.leaf_area is not None:
+        raise ValueError("leaf_area_index is given, but the table has a column leaf_area; give one of them")
+    individuals = check_integer("individuals", individuals)
+    check_seed(seed)
+    turn_rng, growth_rng = np.random.default_rng(seed).spawn(2)
+    by_species = _habits_by_species(habits, trees)
+    species = trees.species if isinstance(habits, Mapping) or habits is None else None
+    names = list(dict.fromkeys(species)) if species else [""]
+    grown = [grow(by_species[name], seed=growth_rng) for name in names for _ in range(individuals)]
+    n = len(trees.x)
+    kind = np.array([names.index(name) for name in species]) if species else np.zeros(n, int)
+    copies = kind * individuals + turn_rng.integers(individuals, size=n)
+    stand = Stand(
+        grown,
+        np.column_stack([trees.x, trees.y, np.zeros(n) if trees.z is None else trees.z]),
+        copies,
+        turn_rng.uniform(0.0, 360.0, n),
+        _scales(trees, grown, copies),
+    )
+    if leaf_area_index is not None and area is not None:
+        return stand.with_leaf_area_index(leaf_area_index, area)
+    return stand if trees.leaf_area is None else stand.with_tree_leaf_area(trees.leaf_area)
+
+
+def _scales(trees: Inventory, grown: list[Tree], copies: np.ndarray) -> Float[np.ndarray, "n 3"]:
+    """Return the horizontal, vertical and radial scale of each tree."""
+
+    def ratio(values: np.ndarray | None, of_individuals: list[float], default: np.ndarray) -> np.ndarray:
+        own = np.array(of_individuals)[copies]
+        if values is None:
+            return default
+        return np.where(np.isnan(values) | (own <= 0.0), default, values / np.where(own > 0.0, own, 1.0))
+
+    vertical = trees.height / np.array([tree.height for tree in grown])[copies]
+    horizontal = ratio(trees.crown, [tree.crown_diameter for tree in grown], vertical)
+    radial = ratio(trees.diameter, [tree.trunk_diameter for tree in grown], vertical)
+    return np.column_stack([horizontal, vertical, radial])
+
+
+def _habits_by_species(habits: Any, trees: Inventory) -> Mapping[str, Habit]:
+    """Return habits by the species that they are of; one for all is that of the species without a name.
+
+    **Raises:** ValueError for a species without a habit; TypeError for objects of another kind.
+    """
+    check_kind("habits", habits, Habit | Mapping | None, "a Habit, a dict of them by species, or None")
+    if isinstance(habits, Habit):
+        return {"": habits}
+    if habits is None:
+        presets = (broadleaf, conifer, shrub, spreading_tree)
+        habits = {"": broadleaf()} if trees.species is None else {f.__name__: f() for f in presets}
+    for name, habit in habits.items():
+        check_kind(f"habits[{name!r}]", habit, Habit, "a Habit")
+    if trees.species is None and "" not in habits:
+        raise ValueError(
+            f"habits has {', '.join(habits)}, but the table has no column species; admissible is one Habit"
+        )
+    for row, name in enumerate(trees.species or ()):
+        if name not in habits:
+            raise ValueError(
+                f"row {row}: species = {name!r} has no habit; habits has {', '.join(map(repr, habits))}"
+            )
+    return habits
+
+
+def inventory_of_table(table: Any, place_of: Callable[[int], str] = "row {}".format) -> Inventory:
+    """Return the inventory of a table by columns, with lengths in m.
+
+    **Arguments:**
+
+    - `table`: a mapping of columns, or a DataFrame.
+    - `place_of`: describes the place of a row, for messages, by its number from 0. Default: "row 3".
+
+    **Raises:** ValueError and TypeError as `stand_from_inventory`.
+    """
+    if not hasattr(table, "keys") or not hasattr(table, "__getitem__"):
+        raise TypeError(
+            f"inventory is {kind_of(table)}; admissible is a table by columns, such as a dict of lists, a "
+            "DataFrame, or what jaxlidar.io.read_inventory returns"
+        )
+    names, units = _columns_in_use([str(name) for name in table.keys()])  # noqa: SIM118
+    labels = {str(label): label for label in table.keys()}  # noqa: SIM118
+    cells = {quantity: list(table[labels[name]]) for quantity, name in names.items()}
+    n = len(cells["x"])
+    for quantity, column in cells.items():
+        if len(column) != n:
+            raise ValueError(f"column {names[quantity]!r} has {len(column)} rows; x has {n}")
+    if n == 0:
+        raise ValueError("the inventory has no row; admissible is one or more")
+    columns: dict[str, Any] = {}
+    for quantity, column in cells.items():
+        if quantity == "species":
+            columns[quantity] = tuple(_species(place_of(i), cell) for i, cell in enumerate(column))
+        else:
+            unit, name = units[quantity], names[quantity]
+            columns[quantity] = np.array(
+                [_quantity(place_of(i), name, quantity, cell, unit) for i, cell in enumerate(column)]
+            )
+    inventory = Inventory(**columns)
+    if inventory.diameter is not None:
+        thick = np.flatnonzero(inventory.diameter > _MAX_SLENDERNESS * inventory.height)
+        if thick.size:
+            i, name = int(thick[0]), names["diameter"]
+            raise ValueError(
+                f"{place_of(i)}: {name} = {inventory.diameter[i]:g} m of a tree of "
+                f"{inventory.height[i]:g} m; admissible is up to {_MAX_SLENDERNESS:g} of the height. A "
+                "column in centimetres is named 'diameter [cm]'"
+            )
+    return inventory
+
+
+def _columns_in_use(names: list[str]) -> tuple[dict[str, str], dict[str, float]]:
+    """Return the names of the columns by quantity, and their units in m or m2.
+
+    **Raises:** ValueError for columns that are missing or ambiguous, and units that are not known.
+    """
+    matches: dict[str, list[tuple[str, str]]] = {}
+    for name in names:
+        match = _NAME_AND_UNIT.match(name)
+        assert match is not None
+        bare = re.sub(r"[\s_\-.]", "", match[1].lower())
+        for quantity, admissible in _NAMES.items():
+            if bare in admissible:
+                matches.setdefault(quantity, []).append((name, (match[2] or match[3] or "").lower()))
+    for quantity in _REQUIRED:
+        if quantity not in matches:
+            raise ValueError(
+                f"the inventory has no column {quantity}; its name may be {', '.join(_NAMES[quantity])}. "
+                f"There are {', '.join(names)}"
+            )
+    units = {}
+    for quantity, columns in matches.items():
+        if len(columns) > 1:
+            raise ValueError(
+                f"{quantity} may be any of the columns {', '.join(repr(name) for name, _ in columns)}; "
+                "remove or rename all but one"
+            )
+        ((name, unit),) = columns
+        admissible_units = {"m2": 1.0} if quantity == "leaf_area" else _UNITS
+        if quantity != "species" and unit and unit not in admissible_units:
+            raise ValueError(f"column {name!r}: admissible units are {', '.join(admissible_units)}")
+        units[quantity] = admissible_units.get(unit, 1.0)
+    return {quantity: columns[0][0] for quantity, columns in matches.items()}, units
+
+
+def _species(place: str, cell: Any) -> str:
+    """Return the name of a species. **Raises:** ValueError, naming the place, where it is missing."""
+    if not isinstance(cell, str) or not cell.strip():
+        raise ValueError(f"{place}: species = {cell!r}; admissible is a name")
+    return cell.strip()
+
+
+def _quantity(place: str, name: str, quantity: str, cell: Any, unit: float) -> float:
+    """Return a number of the table in m or m2. **Raises:** ValueError, naming the place and the column."""
+    try:
+        # None and empty texts stand for what was not measured, as NaN does.
+        value = np.nan if cell is None or not str(cell).strip() else unit * float(cell)
+    except (TypeError, ValueError):
+        raise ValueError(f"{place}: {name} = {cell!r} is no number") from None
+    if np.isnan(value):
+        if quantity in _OPTIONAL_CELLS:
+            return value
+        raise ValueError(f"{place}: {name} is missing; a tree needs its {quantity.replace('_', ' ')}")
+    low, high = _LIMITS[quantity]
+    is_open = quantity in ("height", *_OPTIONAL_CELLS)
+    if not (low < value <= high or (value == low and not is_open)):
+        opening, measure = "(" if is_open else "[", "m2" if quantity == "leaf_area" else "m"
+        raise ValueError(
+            f"{place}: {name} = {value:.9g} {measure} is outside the admissible range "
+            f"{opening}{low:g}, {high:g}]"
+        )
+    return value
