@@ -196,12 +196,14 @@ def _trace_shot(
     scene, model = aim_at(scene, setup.lidar, offset), make_waveform_model(setup)
     if not setup.plan.is_random:
         batch = ShotBatch.of_response(trace_device_scene(scene, key), model)
-        errors = jax.tree.map(jnp.zeros_like, _with_errors(batch))
-        return _shot_results(model, batch, ShotErrors(*errors, jnp.zeros(())), jnp.zeros((), jnp.int32))
+        waveform, energy_budget = jax.tree.map(jnp.zeros_like, _with_errors(batch))
+        errors = ShotErrors(waveform, energy_budget, jnp.zeros(()))
+        return _shot_results(model, batch, errors, jnp.zeros((), jnp.int32))
 
     refine = _add_batches if scene.config.follows_higher_orders else _densify_lattices
     estimate = refine(scene, model, key, rtol)
-    errors = ShotErrors(*estimate.stderr, _relative_error(estimate))
+    waveform_stderr, energy_budget_stderr = estimate.stderr
+    errors = ShotErrors(waveform_stderr, energy_budget_stderr, _relative_error(estimate))
     return _shot_results(model, estimate.mean_only, errors, estimate.count * setup.plan.photons_traced)
 
 
