@@ -47,7 +47,7 @@
 
 ## Leaf traits from leaf spectra
 
-`invert_leaves`, `LeafFit`.
+`invert_leaves`, `LeafFit`, `GapLightWarning`.
 
 ## Files
 
@@ -69,7 +69,7 @@ from inversion.fit.result import Retrieval, Retrievals
 from inversion.fit.retrieval import retrieve
 from inversion.fit.retrieval_many import RetrievalProgress, retrieve_many
 from inversion.fit.unknowns import Unknown
-from inversion.leaf.leaves import LeafFit, invert_leaves
+from inversion.leaf.leaves import GapLightWarning, LeafFit, invert_leaves
 from inversion.metrics.comparison import ComparedColumn, Comparison, ComparisonStatistics, compare
 from inversion.metrics.cover import (
     GroundAndCanopy,
@@ -174,6 +174,7 @@ __all__ = [
     # Leaf traits from leaf spectra.
     "invert_leaves",
     "LeafFit",
+    "GapLightWarning",
     # Files.
     "files",
 ]

@@ -31,6 +31,8 @@ CHOSEN = {
     "hectare": 1,
     "strip": 2,
     "recorded_shots": 0,
+    "gedi_file": 0,
+    "photon_track": 1,
 }
 
 

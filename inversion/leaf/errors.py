@@ -50,6 +50,8 @@ _SCATTERING = 0.04
 # Grid of lengths l, nm, and of variances of the model error over that of the noise.
 _LENGTHS = (20.0, 60.0, 200.0, 600.0)
 _RATIOS = (0.0, 0.1, 0.5, 2.0, 10.0, 50.0, 300.0, 3000.0)
+# Bands, nm, in which leaves are opaque: blue, by pigments, and the strongest band of water.
+_OPAQUE_BANDS = ((440.0, 460.0), (1925.0, 1955.0))
 # Largest number of means of neighbouring bands.
 _MEANS = 128
 # Smallest eigenvalue of the normal matrix, of unit diagonal, of a combination of traits that is determined.
@@ -101,8 +103,12 @@ def trait_errors(
     fit_of_trait: Int[np.ndarray, " n"],
     noise_is_given: bool,
     chunk: int,
-) -> Float[Array, "leaves n"]:
-    """Return standard errors of all traits.
+) -> tuple[Float[Array, "leaves n"], Float[np.ndarray, " leaves"]]:
+    """Return standard errors of all traits, and the light that passed leaves through gaps.
+
+    The latter is the mean transmittance beyond that of the fit to all bands, in blue light and in the water
+    band, whichever is less; zero where a leaf lacks the bands or the transmittance. No leaf lets as much
+    light through in both, and light through gaps has no colour.
 
     **Arguments:**
 
@@ -120,7 +126,8 @@ def trait_errors(
     sigma = jnp.where((np.arange(order.size) < n_bands)[None, None], sigma[..., order], jnp.inf)
     centre = np.mean(np.reshape(wavelengths[order], (-1, bands_per_mean)), axis=1)
     stacked = jax.tree.map(lambda *arrays: jnp.stack(arrays, axis=1), *fits)
-    return _trait_errors(
+    is_opaque = np.stack([(wavelengths >= low) & (wavelengths <= high) for low, high in _OPAQUE_BANDS])
+    errors, gap_light = _trait_errors(
         stacked._replace(bands=stacked.bands[..., order]),
         observed[..., order],
         sigma,
@@ -128,9 +135,12 @@ def trait_errors(
         LeafSurface(*(x[order] for x in surface)),
         jnp.asarray(centre, sigma.dtype),
         jnp.asarray(fit_of_trait),
+        # Bands that fill up the last mean are used by no leaf.
+        jnp.asarray(is_opaque[:, order], sigma.dtype),
         noise_is_given,
         chunk,
     )
+    return errors, np.asarray(gap_light)
 
 
 @partial(jax.jit, static_argnames=("noise_is_given", "chunk"))
@@ -142,10 +152,13 @@ def _trait_errors(
     surface: LeafSurface,
     centre: Array,
     fit_of_trait: Array,
+    is_opaque: Array,
     noise_is_given: bool,
     chunk: int,
-) -> Array:
-    """Standard errors of all traits of leaves whose bands are sorted by wavelength, (leaves, n).
+) -> tuple[Array, Array]:
+    """Standard errors of all traits, (leaves, n), and light through gaps, (leaves,): see `trait_errors`.
+
+    Bands are sorted by wavelength.
 
     For each leaf, in numbered steps below:
 
@@ -180,7 +193,7 @@ def _trait_errors(
         content_columns = absorption[:, None] * dR_dk[None] / x[0]
         return values, jnp.concatenate([N_column[None], content_columns]), dR_dk * k[None]
 
-    def errors_of_leaf(leaf: tuple[LinearisedFit, Array, Array]) -> Array:
+    def errors_of_leaf(leaf: tuple[LinearisedFit, Array, Array]) -> tuple[Array, Array]:
         fit, observed, sigma = leaf
         is_used = jnp.isfinite(observed) & jnp.isfinite(sigma)
         weight = jnp.where(is_used, 1.0 / sigma**2, 0.0)
@@ -242,7 +255,11 @@ def _trait_errors(
         correlated = jnp.repeat(correlated, len(_RATIOS), axis=0) * strength[:, None]
         independent = jnp.sum(gain**2 * jnp.where(is_used, sigma, 0.0)[None] ** 2, axis=(1, 2))
         trait_variance = einsum("g,gi->i", probability * variance, correlated + independent[None])
-        return jnp.sqrt(trait_variance)
+
+        # Residuals of transmittance are zero where there is no sample.
+        n_opaque = jnp.sum(is_opaque * is_used[1][None], axis=1)
+        excess = jnp.sum(is_opaque * residual[1][None], axis=1) / jnp.maximum(n_opaque, 1)
+        return jnp.sqrt(trait_variance), jnp.min(excess)
 
     return map_in_chunks(errors_of_leaf, (fits, observed, sigma), chunk)
 

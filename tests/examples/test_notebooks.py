@@ -44,7 +44,8 @@ def test_notebooks_are_short_and_say_what_to_change(name):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
 def test_code_runs(name, monkeypatch):
-    monkeypatch.delenv("GEDI_L1B", raising=False)
+    for variable in ("GEDI_L1B", "GEDI_L2A", "ATL03", "ATL08"):
+        monkeypatch.delenv(variable, raising=False)
     before = matplotlib.get_backend()
     matplotlib.use("agg")
     scope = {"__name__": "__main__"}
@@ -61,10 +62,12 @@ def test_code_runs(name, monkeypatch):
 def test_there_are_notebooks():
     assert NAMES == [
         "first_waveform",
+        "gedi_file",
         "ground_under_trees",
         "hectare",
         "leaf_traits",
         "peak_detectors",
+        "photon_track",
         "recorded_shots",
         "strip",
     ]

@@ -141,10 +141,12 @@ def test_other_codes(run, name, package):
 
 @pytest.mark.slow
 def test_measured_leaves(run, shared):
-    paths = [shared / "leaves" / name for name in ("angers_half.npz", "lopex_half.npz")]
-    record = run("leaf_databases", *paths)
+    names = ("angers_half.npz", "lopex_half.npz", "nasa_fft_quarter.npz")
+    record = run("leaf_databases", *(shared / "leaves" / name for name in names))
     for trait in ("Cw", "Cm"):
         assert np.mean(np.abs(over_error(record, trait)) < 2) > 0.95
+    assert all(summary_row["within"] > 0.85 for summary_row in record["summary"])
+    assert any("needles" in summary_row["what"] for summary_row in record["summary"])
 
 
 @pytest.mark.slow
