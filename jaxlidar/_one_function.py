@@ -13,6 +13,7 @@ import jax
 from jax import lax
 
 State = TypeVar("State")
+Result = TypeVar("Result")
 
 # From this version of JAX on, XLA finds the loops itself, and keeps barriers.
 _FIRST_VERSION_WITHOUT_HINTS = (0, 12)
@@ -22,14 +23,14 @@ def _needs_hints() -> bool:
     return jax.__version_info__ < _FIRST_VERSION_WITHOUT_HINTS and jax.default_backend() == "cpu"
 
 
-def _called_separately(function: Callable[[State], State], **attributes: str) -> Callable[[State], State]:
+def _called_separately(function: Callable[[State], Result], **attributes: str) -> Callable[[State], Result]:
     """Return `function`, which the compiler calls and does not inline, with more attributes for XLA."""
     # Experimental: only where it is needed.
     from jax.experimental.xla_metadata import set_xla_metadata
 
     compiled = jax.jit(function)
 
-    def with_attributes(values: State) -> State:
+    def with_attributes(values: State) -> Result:
         # XLA's own attributes. A version that does not know them compiles the function as usual.
         with set_xla_metadata(inlineable="false", **attributes):
             return compiled(values)
@@ -37,7 +38,7 @@ def _called_separately(function: Callable[[State], State], **attributes: str) ->
     return with_attributes
 
 
-def one_function(loop: Callable[[State], State]) -> Callable[[State], State]:
+def one_function(loop: Callable[[State], Result]) -> Callable[[State], Result]:
     """Return `loop`, compiled as one function on CPUs; elsewhere as it is.
 
     The loop must not scatter. So it cannot be differentiated in reverse, which turns gathers into scatters.
