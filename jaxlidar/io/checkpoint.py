@@ -23,6 +23,7 @@ import contextlib
 import io
 import os
 import sqlite3
+import stat
 import threading
 import warnings
 import zipfile
@@ -169,11 +170,12 @@ def open_checkpoint(path: str | os.PathLike[str], problem: Mapping[str, str]) ->
     with contextlib.ExitStack() as stack:
         with _plain_errors(path):
             path.parent.mkdir(parents=True, exist_ok=True)
-            # SQLite would deny a group the right to write that its umask grants.
-            path.touch()
-            if not path.is_file():
+            if not _is_missing_or_regular(path):
                 raise OSError("it is no regular file")
             stack.enter_context(_run_lock(path))
+            # Only now: a run that has the lock may remove the file. SQLite would deny a group the right to
+            # write that its umask grants.
+            path.touch()
             connection = stack.enter_context(contextlib.closing(_connect(path)))
             _lock_and_check(connection, path, problem)
         yield Checkpoint(path, connection)
@@ -236,6 +238,15 @@ def _file_number(path: Path) -> int | None:
         return path.stat().st_ino
     except FileNotFoundError:
         return None
+
+
+def _is_missing_or_regular(path: Path) -> bool:
+    """Return False for folders, devices and the like."""
+    # One look: another run may remove the file at any moment.
+    try:
+        return stat.S_ISREG(path.stat().st_mode)
+    except FileNotFoundError:
+        return True
 
 
 def check_same_problem(
