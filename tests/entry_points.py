@@ -600,6 +600,12 @@ ENTRY_POINTS: dict[str, Callable[[], EntryPoint]] = {
         missing=("pairs",),
         messages={"pairs": "ground"},
     ),
+    "plot.profile": lambda: EntryPoint(
+        jl.plot.profile, {"height": np.arange(3.0), "density": np.ones(2)}, missing=("density",)
+    ),
+    "plot.averaging_kernel": lambda: EntryPoint(
+        jl.plot.averaging_kernel, {"kernel": np.ones((2, 2)), "height": np.arange(3.0)}
+    ),
     "plot.spectrum": lambda: EntryPoint(
         lambda wavelength: jl.plot.spectrum(PROSPECT, wavelength=wavelength), {"wavelength": BANDS}
     ),

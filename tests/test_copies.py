@@ -76,6 +76,7 @@ INSTANCES = {
     "jaxlidar.UnitWarning": jl.UnitWarning("divergence"),
     "jaxlidar.VoxelMap": VOXELS,
     "jaxlidar.Word": jl.LSystem([("A", 0.1)], [jl.Rule("A", grown)]).rewrite(1),
+    "inversion.GapLightWarning": inversion.GapLightWarning("gaps"),
     "jaxlidar.io.FileWarning": jl.io.FileWarning("skipped"),
     "jaxlidar.io.ShotTable": jl.io.ShotTable({"ground": jl.io.Column(np.ones(2), "m", "elevation")}),
     "jaxlidar.io.Case": jl.io.Case(LIDAR, SCENE, jax.random.key(0), {"rtol": 0.1}),

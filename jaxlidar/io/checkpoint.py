@@ -55,6 +55,8 @@ _ENTRY_DAMAGE = (
     zipfile.BadZipFile,
 )
 
+# After so many attempts, an error of SQLite is no trace of a lock that has just been removed.
+_MAX_LOCK_ATTEMPTS = 20
 # Held while a thread takes the lock of a run.
 _ACQUIRING = threading.Lock()
 
@@ -200,11 +202,12 @@ def _run_lock(path: Path) -> Iterator[None]:
     """
     lock_path = path.with_name(path.name + ".lock")
     with contextlib.ExitStack() as stack:
-        number = None
+        number, attempts = None, 0
         while number is None or number != _file_number(lock_path):
             # A run that has just ended removes its lock. What was locked here may then be a file without a
             # name, which keeps nobody else out: lock the next one.
             stack.close()
+            attempts += 1
             # POSIX drops the locks of a process on a file when any descriptor of it is closed, as after its
             # creation here, while another thread may have locked it.
             with _ACQUIRING:
@@ -213,10 +216,14 @@ def _run_lock(path: Path) -> Iterator[None]:
                 connection = stack.enter_context(contextlib.closing(_connect(lock_path)))
                 try:
                     connection.execute("BEGIN EXCLUSIVE")
-                except sqlite3.OperationalError:
-                    # SQLite refuses a file that has been removed with an error of input and output.
-                    if number == _file_number(lock_path):
+                except sqlite3.OperationalError as error:
+                    # SQLite refuses a file that has been removed with an error of input and output. The next
+                    # file may have the number of the removed one.
+                    is_in_use = error.sqlite_errorcode & 0xFF == sqlite3.SQLITE_BUSY
+                    may_be_removed = not is_in_use and attempts < _MAX_LOCK_ATTEMPTS
+                    if number == _file_number(lock_path) and not may_be_removed:
                         raise
+                    number = None
         try:
             yield
         finally:
