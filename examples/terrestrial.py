@@ -26,6 +26,8 @@ from jaxlidar.io import atomic_write
 SENSOR = np.array([0.0, -14.0, 1.7])
 VOXEL_SIZE, LEAF_AREA = 0.25, 0.004
 LAYER = 1.0
+# Range up to which the figure goes, m.
+REACH = 25.0
 
 
 def tree_scene() -> tuple[jl.Scene, jl.VoxelMap]:
@@ -63,18 +65,13 @@ def draw(survey: jl.Survey, returns: jl.DiscreteReturns, voxels: jl.VoxelMap, st
     view, side, profile = figure.subplots(1, 3, width_ratios=(1.1, 1.0, 0.75))
     is_first = returns.number == 1
     shot = returns.shot[is_first]
-    image = view.scatter(
-        np.asarray(survey.azimuth)[shot],
-        np.asarray(survey.zenith)[shot] - 90.0,
-        c=returns.range[is_first],
-        # Squares as wide as a step of the scan.
-        s=(4.0 * step) ** 2,
-        marker="s",
-        cmap="viridis_r",
-        linewidths=0,
-        rasterized=True,
-    )
-    figure.colorbar(image, ax=view, label="range of the first return (m)", shrink=0.85)
+    azimuth, column = np.unique(np.asarray(survey.azimuth), return_inverse=True)
+    elevation, row = np.unique(np.asarray(survey.zenith) - 90.0, return_inverse=True)
+    distance = np.full((elevation.size, azimuth.size), np.nan)
+    distance[row[shot], column[shot]] = returns.range[is_first]
+    # Beyond the tree there is ground alone.
+    image = view.pcolormesh(azimuth, elevation, distance, cmap="viridis_r", vmax=REACH, rasterized=True)
+    figure.colorbar(image, ax=view, label="range of the first return (m)", extend="max")
     view.set(title="as the scanner sees it", xlabel="azimuth (degrees)", ylabel="elevation (degrees)")
     for material, colour in (("ground", "#8c6d46"), ("leaf", "#009E73"), ("bark", "#3b2a1a")):
         _, y, z = returns.position[returns.material == material].T
@@ -83,7 +80,7 @@ def draw(survey: jl.Survey, returns: jl.DiscreteReturns, voxels: jl.VoxelMap, st
         )
     side.plot(0.0, SENSOR[2], "^", color="#D55E00", label="scanner")
     side.set(title="from the side", xlabel="distance to the north (m)", ylabel="height (m)", aspect="equal")
-    side.set_ylim(-0.5, 20.5)
+    side.set(xlim=(-1.0, REACH), ylim=(-0.5, 22.5))
     side.legend(frameon=False, fontsize=8, loc="upper left", ncols=2)
     edges, seen, present = profiles(returns, voxels)
     profile.stairs(present, edges, orientation="horizontal", label="leaf area", color="k")
