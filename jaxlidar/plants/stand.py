@@ -1,7 +1,7 @@
 """Stands: many copies of a few trees, each with its own place, azimuth, size and leaf area."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, final, overload
 
 import numpy as np
@@ -18,7 +18,7 @@ from jaxlidar.scenes.terrain import Terrain
 class Stand(Sequence[Tree]):
     """A stand: n trees that are copies of a few individuals. It is a sequence of `Tree`.
 
-    `jaxlidar.voxelise` takes a stand of thousands of trees in seconds, as it voxelises the individuals alone.
+    `jaxlidar.voxelise` takes a stand of thousands of trees, as it voxelises the individuals alone.
     `forest`, `stand_of_leaf_area` and `stand_from_inventory` make stands.
 
     **Arguments:**
@@ -159,18 +159,8 @@ class Stand(Sequence[Tree]):
                 area,
             )
         tree = self.individuals[self.individual[index]]
-        horizontal, vertical, radial = self.scale[index].tolist()
-        stretch = np.array([horizontal, horizontal, vertical])
-        stretched = replace(
-            tree,
-            start=tree.start * stretch,
-            end=tree.end * stretch,
-            radius_start=tree.radius_start * radial,
-            radius_end=tree.radius_end * radial,
-            bud_position=tree.bud_position * stretch,
-            bud_radius=tree.bud_radius * np.cbrt(stretch.prod()),
-        )
-        return stretched.rotated(float(self.azimuth[index])).translated(self.position[index])
+        scaled = tree.scaled(self.scale[index])
+        return scaled.rotated(float(self.azimuth[index])).translated(self.position[index])
 
     def __str__(self) -> str:
         count = len(self.individuals)

@@ -1,6 +1,6 @@
 """The geometry of a tree: branch segments, which are cone frustums, and leaf clumps around buds."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import final
 
@@ -229,24 +229,28 @@ class Tree:
             bud_direction=self.bud_direction @ rotation.T,
         )
 
-    def scaled(self, factor: float) -> "Tree":
+    def scaled(self, factor: float | Sequence[float] | Float[np.ndarray, "3"]) -> "Tree":
         """Scale the tree about the origin: all coordinates and radii, of wood and leaf clumps.
 
         **Arguments:**
 
-        - `factor`: scale factor, positive.
+        - `factor`: scale factor, positive; or three: on horizontal distances, on heights, and on radii of
+          wood. The volume of leaf clumps then follows that of the crown.
 
         **Returns:** a `Tree`.
 
-        **Raises:** ValueError for a factor that is not positive.
+        **Raises:** ValueError for a factor that is not positive, and for another number of factors.
         """
-        check_number("factor", factor, 0.0, low_open=True)
+        check_range("factor", factor, 0.0, low_open=True)
+        check_shape("factor", factor, (), (3,))
+        horizontal, vertical, radial = np.broadcast_to(np.asarray(factor, float), (3,))
+        stretch = np.array([horizontal, horizontal, vertical])
         return replace(
             self,
-            start=self.start * factor,
-            end=self.end * factor,
-            radius_start=self.radius_start * factor,
-            radius_end=self.radius_end * factor,
-            bud_position=self.bud_position * factor,
-            bud_radius=self.bud_radius * factor,
+            start=self.start * stretch,
+            end=self.end * stretch,
+            radius_start=self.radius_start * radial,
+            radius_end=self.radius_end * radial,
+            bud_position=self.bud_position * stretch,
+            bud_radius=self.bud_radius * np.cbrt(stretch.prod()),
         )
