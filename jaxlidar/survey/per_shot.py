@@ -198,19 +198,15 @@ def _trace_shot(
         batch = ShotBatch.of_response(trace_device_scene(scene, key), model)
         waveform, energy_budget = jax.tree.map(jnp.zeros_like, _with_errors(batch))
         errors = ShotErrors(waveform, energy_budget, jnp.zeros(()))
-        return _shot_results(model, batch, errors, jnp.zeros((), jnp.int32))
+        return make_shot_results(model, *batch, errors, photons=jnp.zeros((), jnp.int32))
 
     refine = _add_batches if scene.config.follows_higher_orders else _densify_lattices
     estimate = refine(scene, model, key, rtol)
     waveform_stderr, energy_budget_stderr = estimate.stderr
     errors = ShotErrors(waveform_stderr, energy_budget_stderr, _relative_error(estimate))
-    return _shot_results(model, estimate.mean_only, errors, estimate.count * setup.plan.photons_traced)
-
-
-def _shot_results(model: WaveformModel, batch: ShotBatch, errors: ShotErrors, photons: Array) -> ShotResults:
-    return make_shot_results(
-        model, batch.components, batch.relative_energy, batch.budget, errors, photons=photons
-    )
+    mean: ShotBatch = estimate.mean_only
+    photons = estimate.count * setup.plan.photons_traced
+    return make_shot_results(model, *mean, errors, photons=photons)
 
 
 def _with_errors(batch: ShotBatch) -> tuple[Array, dict[str, Array]]:
