@@ -316,7 +316,7 @@ EVALUATE_MODEL = """
 from tests.planning.test_memory import layered, room_for
 
 orders, layers, end = int(sys.argv[1]), int(sys.argv[2]), float(sys.argv[3])
-model, start = layered(orders, layers, end, max_memory=15.0, n_photons=2048)
+model, start = layered(orders, layers, end, max_memory=15.0, n_photons=2048, histories=True)
 model(start)
 assert model.inputs.tangents_per_pass == layers + 1
 print(1e9 * room_for(model, layers + 1), watched(lambda: model(start)))
