@@ -62,7 +62,8 @@ def main(argv=None):
             ax.errorbar(chemistry, differences, 2 * error, fmt="o", ms=2, lw=0.5, color=COLOURS[0])
             ax.axhline(0.0, color="0.6", lw=0.8)
             within = np.mean(np.abs(differences) < 2 * error)
-            ax.set_title(f"{name}: {trait}, {100 * within:.0f} % within 2 s.e.", fontsize=8)
+            ax.set_title(f"{name}:\n{trait}, {100 * within:.0f} % within 2 s.e.", fontsize=8)
+            ax.locator_params(axis="x", nbins=4)
             ax.set(xlabel=f"measured ({CHEMISTRY[trait][1]})")
         for row in axes:
             next(ax for ax in row if ax.axison).set_ylabel("fitted less measured")
@@ -72,9 +73,9 @@ def main(argv=None):
         "leaf_databases",
         rows,
         title="Measured leaves",
-        caption="""Fitted less measured chemistry, leaf by leaf, with bars of two standard errors as the fit
-        states them: they should reach zero for 95 % of the leaves. Errors of Cab and Car contain 12 % for
-        what spectra do not tell. Cw and Cm of needles come from a domain of their own.""",
+        caption="""Fitted less measured chemistry, leaf by leaf, with bars of two standard errors as the
+        fit states them: they should reach zero for 95 % of the leaves. Errors of Cab and Car contain 12
+        and 14 % for what spectra do not tell. Cw and Cm of needles come from a domain of their own.""",
         unchecked="""Chemistry has errors of its own, which are not known and not in the bars. Coefficients of
         PROSPECT-D were calibrated with such leaves, some of these among them.""",
         draw=draw,
