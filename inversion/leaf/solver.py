@@ -19,7 +19,8 @@ held for the step while the others move, and a trait that would leave its bounds
 without anthocyanins or brown pigments have their minimum on one.
 
 **Convergence.** A Gauss-Newton step would lower chi^2 by no more than (0.02)^2 times the reduced chi^2: it
-would move the traits by less than 0.02 standard errors.
+would move the traits by less than 0.02 standard errors. A fall that rounding of the residuals alone promises
+does not count: spectra without noise are met to the last place.
 
 Leaves run in chunks that fit into the processor's cache, each chunk until its slowest leaf has ended. On
 measured leaves `optimistix.LevenbergMarquardt` under `jax.vmap`, with unknowns that never reach a bound, took
@@ -48,6 +49,8 @@ _SMALL_STEP = 0.02
 _ROUNDING_UNITS = 64
 # Least measurable fall of chi-squared, in units of its last place.
 _CHI2_UNITS = 8
+# Rounding of a residual that no step can remove, in units of the last place of a reflectance of 1.
+_RESIDUAL_UNITS = 2
 # Accepting the start, which is tried first, lowers the damping once: the first step has a tenth of it.
 _FIRST_DAMPING, _LEAST_DAMPING, _LARGEST_DAMPING = 1e-2, 1e-5, 1e8
 # Fewest bands of the preliminary fit that gives the start of the fit to all bands.
@@ -159,10 +162,13 @@ def _fit_leaf(
     inverse_sigma = jnp.where(is_used, 1.0 / leaf.sigma, 0.0)
     n_samples = jnp.sum(is_used)
     degrees_of_freedom = jnp.maximum(n_samples - n_unknowns, 1)
+    eps = float(jnp.finfo(start.dtype).eps)
+    mean_weight = jnp.sum(inverse_sigma**2) / jnp.maximum(n_samples, 1)
     # Reduced chi-squared of residuals that are all rounding.
-    rounding_floor = (
-        residual_rounding(start.dtype) ** 2 * jnp.sum(inverse_sigma**2) / jnp.maximum(n_samples, 1)
-    )
+    rounding_floor = residual_rounding(start.dtype) ** 2 * mean_weight
+    # Residuals of independent errors with variance v promise a fall of v for each unknown. That of rounding
+    # cannot be had: at the minimum of spectra without noise every step would be refused for it.
+    fall_of_rounding = n_unknowns * (_RESIDUAL_UNITS * eps) ** 2 * mean_weight
 
     def evaluate(x: Array) -> NormalEquations:
         """Run PROSPECT at x and accumulate its normal equations (columns: see the module's docstring)."""
@@ -200,7 +206,7 @@ def _fit_leaf(
         undamped = step(point, _LEAST_DAMPING)
         fall = -matmul(point.gradient, undamped)
         small = _SMALL_STEP**2 * jnp.maximum(point.chi2 / degrees_of_freedom, rounding_floor)
-        small = jnp.maximum(small, _CHI2_UNITS * jnp.finfo(fall.dtype).eps * point.chi2)
+        small = jnp.maximum(small, jnp.maximum(_CHI2_UNITS * eps * point.chi2, fall_of_rounding))
         return (fall <= small) & jnp.isfinite(point.chi2)
 
     def iterate(state: LeafFitState) -> LeafFitState:
