@@ -19,9 +19,11 @@ from jaxlidar.scenes.triangle_tree import ROW
 
 # Copies of a batch's response that are alive at once: sums of photons, of groups, and the result.
 _RESPONSE_COPIES = 3
-# Tangents of a response that are alive at once, for each column of a Jacobian: the sum of photons, and the
-# result.
-_RESPONSE_TANGENTS = 2
+# Tangents of a response that are alive at once, for each column of a Jacobian: the sum of photons becomes
+# the result.
+_RESPONSE_TANGENTS = 1
+# Numbers of a photon, and of a ray segment, for each column of a score function.
+_SCORE_NUMBERS = 2
 # Tangents of a photon, and of a ray segment, that are alive at once.
 _STATE_TANGENTS = 4
 # Numbers of a photon, and of a ray segment, that are alive at once.
@@ -131,7 +133,7 @@ def scored_bytes(config: TraceConfig, bins: TimeBins, *, cells: int, columns: in
     **Arguments:** `cells`: voxels of the map. `columns`: unknowns that change extinction alone.
     """
     rows = columns * wavelengths * bins.padded
-    per_core = _RESPONSE_COPIES * rows + _RESPONSE_TANGENTS * columns * _photons_and_segments(config)
+    per_core = _RESPONSE_COPIES * rows + _SCORE_NUMBERS * columns * _photons_and_segments(config)
     slopes = _SLOPE_TABLES * columns * cells
     return float(_number_bytes() * ((os.cpu_count() or 1) * per_core + slopes))
 
