@@ -126,8 +126,10 @@ def integrate_over_bins(
     """Integrate exp(-kappa tau) ds over the pieces of each segment, bin by bin.
 
     1. Number the bin in which the segment starts.
-    2. For that bin and those behind it: the end of the piece is the bin's edge or the segment's end, and the
-       integral is exp(-kappa tau) before the piece, times its length, times its mean decay.
+    2. Cut the segment into a first piece up to the bin's edge, pieces that fill a bin, and the rest. As the
+       extinction is constant, all pieces of one kind have the same transmittance, and the same integral for
+       light that enters them undiminished.
+    3. From bin to bin: that integral times the transmittance up to the piece.
 
     **Arguments:** `start_position`: of the start of each segment on the axis of bins.
 
@@ -141,16 +143,31 @@ def integrate_over_bins(
     # piece beyond the end is zero.
     count = bins.max_span - 2 + bins.max_span % 2
 
-    def piece(carry, j):
-        transmittance, start = carry
-        end = jnp.clip(first_number + (j + 0.5), start_position, end_position)
-        length = (end - start) * bin_length
-        decay, mean = _decay(kappa * segments.extinction * length)
-        return (transmittance * decay, end), transmittance * mean * length
+    # Pieces of the first bin, of whole bins, and of the last one; in bins.
+    first_length = jnp.minimum(first_number + 0.5, end_position) - start_position
+    to_last_edge = jnp.maximum(end_position - (first_number + 0.5), 0.0)
+    n_whole = jnp.floor(lax.stop_gradient(to_last_edge))
+    lengths = (first_length, jnp.ones_like(first_length), to_last_edge - n_whole)
 
-    # A scan computes each piece once; unrolled, compilers compute them again for every element.
-    state = vary_together((jnp.exp(-kappa * segments.depth), start_position))
-    _, pieces = lax.scan(piece, state, jnp.arange(count, dtype=start_position.dtype))
+    def integral_over(length: Scalar) -> Scalar:
+        """Return the integral over a piece, of light that enters it undiminished."""
+        length = length * bin_length
+        return mean_decay(kappa * segments.extinction * length) * length
+
+    # Optimisation barrier: these would be computed again for each bin.
+    first, whole, last = once(tuple(integral_over(length) for length in lengths))
+    first_depth = kappa * segments.extinction * (first_length * bin_length)
+    depth, depth_of_whole = once((kappa * segments.depth, kappa * segments.extinction * bin_length))
+
+    def piece(number: Array) -> Scalar:
+        n_before = number - 1.0
+        depth_before = depth + first_depth + n_before * depth_of_whole
+        integral = jnp.where(n_before < n_whole, whole, jnp.where(n_before > n_whole, 0.0, last))
+        return jnp.exp(-depth_before) * integral
+
+    # All pieces in one kernel: in a loop over bins, the overhead of kernels takes as long as they do.
+    behind_first = jax.vmap(piece)(jnp.arange(1, count, dtype=start_position.dtype))
+    pieces = jnp.concatenate([(jnp.exp(-depth) * first)[None], behind_first])
     return padded_index(bins, first_number, count), pieces
 
 
