@@ -15,6 +15,10 @@ one of two ways:
   gives N^1/4 / N. (He and Owen 2016, J. R. Stat. Soc. B 78, 917, prove this rate for stratified points along
   a space-filling curve.) So N grows and the number of batches stays at the fewest that tell a standard error.
   A lattice of N = m N_0 rays is traced in m parts of N_0 rays, since compiled programs need fixed shapes.
+
+Lattices of narrow footprints begin with as few rays as the tolerance allows, and those of several shots are
+traced together (`jaxlidar.trace.lattices_of_shots`). Shots that are not within the tolerance then get more
+parts, as many as the error of each asks for.
 """
 
 import dataclasses
@@ -44,13 +48,20 @@ from jaxlidar.spectral.apply_optics import (
     component_samples,
     make_waveform_model,
     relative_energy_samples,
+    setup_optics,
     total_samples,
 )
 from jaxlidar.survey.results import ShotErrors, ShotResults, make_shot_results
 from jaxlidar.survey.strategy import AbstractStrategy, slices_of_shots
 from jaxlidar.trace.device_scene import DeviceScene, aim_at, build_device_scene
-from jaxlidar.trace.footprint import RaySlice
-from jaxlidar.trace.response import Response, trace_device_scene, trace_first_only
+from jaxlidar.trace.footprint import RaySlice, make_beam
+from jaxlidar.trace.lattices_of_shots import (
+    LatticeSums,
+    can_trace_parts,
+    response_of_lattice,
+    trace_parts,
+)
+from jaxlidar.trace.response import Response, footprint_shift, trace_device_scene, trace_first_only
 
 # Largest number of shots of a chunk, of first order alone and of more: a chunk cannot be interrupted.
 _CHUNK_FIRST_ORDER, _CHUNK_HIGHER_ORDERS = 128, 16
@@ -61,6 +72,16 @@ _RAYS_SIDE_BY_SIDE = 512
 # Batches of a shot follow one another, so that steps could be as small as one. The error is looked at after
 # every fourth: an estimate that stops at the first moment at which it seems precise is wrong more often.
 _BATCH_STEPS = StepRule(max_growth=1.0, min_step=4)
+# Lattices of at most so many rays are those of narrow footprints ...
+_NARROW_RAYS = 64
+# ... which are traced in parts of so many rays, for so many shots together ...
+_RAYS_OF_PART, _SHOTS_AT_ONCE = 8, 8
+# ... with as many parts in the first round that about ten rays of all lattices meet what covers the fraction
+# `rtol` of a footprint. With fewer, shots of which no ray meets the edge of a crown would seem exact ...
+_LEAST_PARTS_TIMES_RTOL = 0.16
+# ... at no more wavelengths than there are histories: the responses of lattices, with optics applied, would
+# be larger.
+_MAX_WAVELENGTHS = 4
 # Coarser lattices are dropped when denser ones are traced: small steps would waste most of the rays.
 _LATTICE_STEPS = StepRule(convergence_rate=0.75, safety=1.2, min_growth=2.0, max_growth=32.0)
 
@@ -181,32 +202,49 @@ class ShotBatch(NamedTuple):
         )
 
 
+class AimedShot(NamedTuple):
+    """One shot of a survey: its device scene, setup and waveform model, and its random key."""
+
+    scene: DeviceScene
+    setup: Setup
+    model: WaveformModel
+    key: PRNGKeyArray
+
+
+def _aim_shot(scene: DeviceScene, setup: Setup, shot: ShotGeometry, key: PRNGKeyArray) -> AimedShot:
+    """Aim the lidar and the device scene, which are those of the survey's middle, at one shot."""
+    offset = aim_offset(setup, shot)
+    # The key follows from the shot's number: its waveform does not depend on chunks or workers.
+    setup, key = setup_of_shot(setup, shot), jax.random.fold_in(key, shot.number)
+    return AimedShot(aim_at(scene, setup.lidar, offset), setup, make_waveform_model(setup), key)
+
+
 def _trace_shot(
     scene: DeviceScene, setup: Setup, shot: ShotGeometry, key: PRNGKeyArray, rtol: Array
 ) -> ShotResults:
     """Trace one shot until its tolerance is met.
 
-    1. Aim the lidar and the device scene, which are those of the survey's middle, at the shot.
-    2. Where nothing is random, trace one batch: its errors are zero.
-    3. Otherwise refine the estimate, by more batches or by denser lattices.
+    Where nothing is random, that is one batch, whose errors are zero. Otherwise the estimate is refined, by
+    more batches or by denser lattices.
     """
-    offset = aim_offset(setup, shot)
-    # The key follows from the shot's number: its waveform does not depend on chunks or workers.
-    setup, key = setup_of_shot(setup, shot), jax.random.fold_in(key, shot.number)
-    scene, model = aim_at(scene, setup.lidar, offset), make_waveform_model(setup)
+    aimed = _aim_shot(scene, setup, shot, key)
     if not setup.plan.is_random:
-        batch = ShotBatch.of_response(trace_device_scene(scene, key), model)
+        batch = ShotBatch.of_response(trace_device_scene(aimed.scene, aimed.key), aimed.model)
         waveform, energy_budget = jax.tree.map(jnp.zeros_like, _with_errors(batch))
         errors = ShotErrors(waveform, energy_budget, jnp.zeros(()))
-        return make_shot_results(model, *batch, errors, photons=jnp.zeros((), jnp.int32))
+        return make_shot_results(aimed.model, *batch, errors, photons=jnp.zeros((), jnp.int32))
+    if scene.config.follows_higher_orders:
+        return _shot_results(aimed, _add_batches(aimed, rtol))
+    return _shot_results(aimed, _densify_lattices(aimed, rtol))
 
-    refine = _add_batches if scene.config.follows_higher_orders else _densify_lattices
-    estimate = refine(scene, model, key, rtol)
+
+def _shot_results(aimed: AimedShot, estimate: RunningMoments) -> ShotResults:
+    """Return the results of a shot from the moments of its batches."""
     waveform_stderr, energy_budget_stderr = estimate.stderr
     errors = ShotErrors(waveform_stderr, energy_budget_stderr, _relative_error(estimate))
     mean: ShotBatch = estimate.mean_only
-    photons = estimate.count * setup.plan.photons_traced
-    return make_shot_results(model, *mean, errors, photons=photons)
+    photons = estimate.count * aimed.setup.plan.photons_traced
+    return make_shot_results(aimed.model, *mean, errors, photons=photons)
 
 
 def _with_errors(batch: ShotBatch) -> tuple[Array, dict[str, Array]]:
@@ -219,8 +257,9 @@ def _relative_error(estimate: RunningMoments) -> Array:
     return relative_error(estimate.mean[0], estimate.stderr[0])
 
 
-def _add_batches(scene: DeviceScene, model: WaveformModel, key: PRNGKeyArray, rtol: Array) -> RunningMoments:
+def _add_batches(aimed: AimedShot, rtol: Array) -> RunningMoments:
     """Trace batch after batch until the error is below the tolerance."""
+    scene, _, model, key = aimed
 
     @eqx.filter_jit
     def trace_batch(number: Array) -> ShotBatch:
@@ -239,9 +278,7 @@ def _add_batches(scene: DeviceScene, model: WaveformModel, key: PRNGKeyArray, rt
     return sample_until_compiled(refine, no_batches, _relative_error, stop, _BATCH_STEPS)
 
 
-def _densify_lattices(
-    scene: DeviceScene, model: WaveformModel, key: PRNGKeyArray, rtol: Array
-) -> RunningMoments:
+def _densify_lattices(aimed: AimedShot, rtol: Array) -> RunningMoments:
     """Trace eight lattices, again with more parts, until the error is below the tolerance.
 
     1. Trace the lattices. Where each has few rays, several are marched side by side: a step costs about as
@@ -250,11 +287,12 @@ def _densify_lattices(
        is needed for.
     3. When the tolerance is met, apply them to the mean of the responses, component by component.
     """
+    scene, _, model, key = aimed
     side_by_side = math.gcd(MIN_BATCHES, max(_RAYS_SIDE_BY_SIDE // scene.config.n_rays, 1))
 
     def trace_lattice(number: Array, n_parts: Array) -> tuple[tuple[Array, dict[str, Array]], Response]:
         response = _trace_lattice(scene, jax.random.fold_in(key, number), n_parts)
-        return (total_samples(response, model), budget_terms(response, model).energy_budget), response
+        return _total_and_budget(response, model), response
 
     def refine(coarser: RunningMoments, n_parts: Array, next_n_parts: Array) -> RunningMoments:
         # The coarser estimate is dropped: a standard error is the scatter of batches of one kind.
@@ -270,6 +308,11 @@ def _densify_lattices(
     stop = StoppingRule(rtol, min_size=1, max_size=MAX_BATCHES_OR_PARTS)
     estimate = sample_until_compiled(refine, no_lattices, _relative_error, stop, _LATTICE_STEPS)
     return estimate._replace(mean_only=ShotBatch.of_response(estimate.mean_only, model))
+
+
+def _total_and_budget(response: Response, model: WaveformModel) -> tuple[Array, dict[str, Array]]:
+    """Return the quantities of `_with_errors`, without those of single components."""
+    return total_samples(response, model), budget_terms(response, model).energy_budget
 
 
 # Its shapes are needed as well as its values: within `filter_jit`, JAX evaluates the function once for both.
@@ -296,9 +339,134 @@ def _zeros(shapes: Any) -> Any:
     return jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), shapes)
 
 
+def _are_narrow(setup: Setup, scene: DeviceScene) -> bool:
+    """Return True if shots are narrow, and of a scene whose lattices can be traced together."""
+    if scene.config.follows_higher_orders or not setup.plan.is_random:
+        return False
+    few_wavelengths = setup.lidar.wavelength.size <= _MAX_WAVELENGTHS
+    return scene.config.n_rays <= _NARROW_RAYS and few_wavelengths and can_trace_parts(scene)
+
+
+def _trace_narrow_shots(
+    scene: DeviceScene, setup: Setup, shots: ShotGeometry, key: PRNGKeyArray, rtol: Array
+) -> ShotResults:
+    """Trace the lattices of narrow shots, again with more parts for those that are not within the tolerance.
+
+    In each round:
+
+    1. Of each shot that is pending, find how many parts its lattices get: in the first round by the
+       tolerance, then by its error.
+    2. Trace the pending shots, several at a time, and replace their results.
+    """
+    n_shots = len(shots.number)
+    max_parts = MAX_BATCHES_OR_PARTS * scene.config.n_rays // _RAYS_OF_PART
+    # Not more than where shots are not narrow.
+    most = -(-scene.config.n_rays // _RAYS_OF_PART)
+    first_parts = jnp.clip(jnp.ceil(_LEAST_PARTS_TIMES_RTOL / rtol), 1, most).astype(jnp.int32)
+
+    def is_pending(n_parts: Array, results: ShotResults) -> Array:
+        return (n_parts == 0) | ((results.error > rtol) & (n_parts < max_parts))
+
+    def trace_some(numbers: Array, n_parts: Array) -> ShotResults:
+        return _trace_together(scene, setup, jax.tree.map(lambda a: a[numbers], shots), n_parts, key)
+
+    def next_round(state: tuple[Array, ShotResults]) -> tuple[Array, ShotResults]:
+        n_parts, results = state
+        following = jnp.minimum(_LATTICE_STEPS.next_size(n_parts, results.error, rtol), max_parts)
+        pending = is_pending(*state)
+        n_parts = jnp.where(pending, jnp.where(n_parts == 0, first_parts, following), n_parts)
+        first, n_pending = jnp.argsort(~pending, stable=True), jnp.sum(pending, dtype=jnp.int32)
+
+        def trace_group(group: Array, results: ShotResults) -> ShotResults:
+            position = group * _SHOTS_AT_ONCE + jnp.arange(_SHOTS_AT_ONCE, dtype=jnp.int32)
+            exists = position < n_pending
+            numbers = first[jnp.minimum(position, n_shots - 1)]
+            new = trace_some(numbers, jnp.where(exists, n_parts[numbers], 0))
+            # Shots that fill up the last group are dropped: their number is that of no shot.
+            numbers = jnp.where(exists, numbers, n_shots)
+            return jax.tree.map(lambda a, b: a.at[numbers].set(b, mode="drop"), results, new)
+
+        return n_parts, jax.lax.fori_loop(0, -(-n_pending // _SHOTS_AT_ONCE), trace_group, results)
+
+    some = jnp.zeros((_SHOTS_AT_ONCE,), jnp.int32)
+    shapes = jax.eval_shape(trace_some, some, some)
+    no_results = jax.tree.map(lambda a: jnp.zeros((n_shots, *a.shape[1:]), a.dtype), shapes)
+    no_parts = jnp.zeros((n_shots,), jnp.int32)
+    return jax.lax.while_loop(lambda s: jnp.any(is_pending(*s)), next_round, (no_parts, no_results))[1]
+
+
+def _trace_together(
+    scene: DeviceScene, setup: Setup, shots: ShotGeometry, n_parts: Int[Array, "*shots"], key: PRNGKeyArray
+) -> ShotResults:
+    """Trace the lattices of a group of shots, each in `n_parts` parts.
+
+    1. List the parts of all lattices of all shots, shot by shot.
+    2. Trace them, a block of parts at a time, and add them to the sums of their lattices.
+    3. Of each shot: apply optics and pulse to the lattices, whose scatter tells the errors, and to their
+       mean.
+    """
+    optics = setup_optics(setup)
+    # Step 1. The list ends, for each shot, at:
+    ends = jnp.cumsum(n_parts * MIN_BATCHES)
+    n_rows, block_size = len(n_parts), len(n_parts) * MIN_BATCHES
+    lattices = jnp.arange(MIN_BATCHES)
+
+    def shifts_of(shot: ShotGeometry) -> Array:
+        keys = jax.vmap(jax.random.fold_in, (None, 0))(_aim_shot(scene, setup, shot, key).key, lattices)
+        return jax.vmap(lambda k: footprint_shift(scene, k))(keys)
+
+    shifts, beams = (
+        jax.vmap(shifts_of)(shots),
+        jax.vmap(lambda s: make_beam(setup_of_shot(setup, s).lidar))(shots),
+    )
+    # Coordinates are relative to the aim point of the first shot: others of its chunk are near it.
+    offsets = jax.vmap(lambda shot: aim_offset(setup, shot))(shots)
+    scene_of_first = aim_at(scene, setup.lidar, offsets[0])
+    aims = jnp.pad(offsets - offsets[:1], ((0, 0), (0, 3 - offsets.shape[1])))
+
+    # Step 2.
+    def trace_block(block: Array | int) -> tuple[Array, Array, LatticeSums]:
+        number = block * block_size + jnp.arange(block_size, dtype=jnp.int32)
+        row = jnp.minimum(jnp.searchsorted(ends, number, side="right"), n_rows - 1)
+        in_shot = number - (ends[row] - n_parts[row] * MIN_BATCHES)
+        lattice, part = in_shot % MIN_BATCHES, in_shot // MIN_BATCHES
+        # Parts that fill up the last block are traced in vain, as the first ones of their shot.
+        exists, count = number < ends[-1], jnp.maximum(n_parts[row], 1)
+        ray_slices = RaySlice(jnp.where(exists, part, 0), count)
+        beams_of_parts = jax.tree.map(lambda a: a[row], beams)
+        sums = trace_parts(
+            scene_of_first, beams_of_parts, aims[row], shifts[row, lattice], ray_slices, _RAYS_OF_PART
+        )
+        # Every part has the energy of the complete beam: the lattice is their mean.
+        weight = jnp.where(exists, 1.0 / count, 0.0)
+        return row, lattice, jax.vmap(lambda w, part: jax.tree.map(lambda a: w * a, part))(weight, sums)
+
+    def add_block(block: Array, sums: LatticeSums) -> LatticeSums:
+        row, lattice, parts = trace_block(block)
+        return jax.tree.map(lambda a, b: a.at[row, lattice].add(b), sums, parts)
+
+    shapes = jax.eval_shape(trace_block, 0)[2]
+    no_sums = jax.tree.map(lambda a: jnp.zeros((n_rows, MIN_BATCHES, *a.shape[1:]), a.dtype), shapes)
+    sums = jax.lax.fori_loop(0, -(-ends[-1] // block_size), add_block, no_sums)
+
+    # Step 3.
+    def results_of(shot: ShotGeometry, sums: LatticeSums) -> ShotResults:
+        aimed = _aim_shot(scene, setup, shot, key)
+        aimed = aimed._replace(model=aimed.model.for_applied_optics())
+        responses = jax.vmap(lambda s: response_of_lattice(scene, s, optics))(sums)
+        values = jax.vmap(lambda response: _total_and_budget(response, aimed.model))(responses)
+        moments = RunningMoments.of_batches(values, responses)
+        batch = ShotBatch.of_response(moments.mean_only, aimed.model)
+        return _shot_results(aimed, moments._replace(mean_only=batch))
+
+    return jax.vmap(results_of)(shots, sums)
+
+
 def _trace_shots(setup: Setup, shots: ShotGeometry, key: PRNGKeyArray, rtol: Array) -> ShotResults:
-    """Trace shots one after the other over one device scene."""
+    """Trace shots over one device scene."""
     scene = build_device_scene(setup, derivatives="none")
+    if _are_narrow(setup, scene):
+        return _trace_narrow_shots(scene, setup, shots, key, rtol)
     # Not `vmap`: the loops of all shots together would run until the slowest of them has met its tolerance,
     # and their arrays would not fit into a processor's cache.
     return jax.lax.map(lambda shot: _trace_shot(scene, setup, shot, key, rtol), shots)

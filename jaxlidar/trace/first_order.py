@@ -26,7 +26,7 @@ from jaxtyping import Array, Float, Int
 from jaxlidar._constants import SPEED_OF_LIGHT
 from jaxlidar._mesh_axes import vary_with
 from jaxlidar._one_function import once
-from jaxlidar._vectors import FAR, Scalar, Vec, along, scale
+from jaxlidar._vectors import FAR, Scalar, Vec, add, along, scale
 from jaxlidar.optics.facets import FACET_BACKSCATTER
 from jaxlidar.optics.laws import AbstractMirror
 from jaxlidar.planning.config import TraceConfig
@@ -128,6 +128,8 @@ class FootprintRays(NamedTuple):
     - `x`, `w`: start and direction. - `excess`: path from the sensor to the start, m, less the slant range.
     - `energy`: fraction of the pulse's. - `surface_distances`: to each surface, m; `end`: to the ground or a
       mesh. - `mesh_normal`: of the triangle that is met; None without meshes.
+    - `group`: number of the group in whose sums the ray counts; None: there is one.
+    - `aim`: the point at which its beam is aimed; None: the origin.
     """
 
     x: Vec
@@ -137,6 +139,12 @@ class FootprintRays(NamedTuple):
     surface_distances: list[Scalar]
     end: Scalar
     mesh_normal: Vec | None
+    group: Int[Array, "..."] | None = None
+    aim: Vec | None = None
+
+    def from_aim(self, point: Vec) -> Vec:
+        """Return the vector from the aim point to a point of each ray, as beams take it."""
+        return point if self.aim is None else add(point, scale(self.aim, jnp.asarray(-1.0)))
 
 
 def move_rays(
@@ -152,10 +160,21 @@ def move_rays(
     return across, energy * (ratio / mean_ratio)
 
 
-def send_rays(scene: DeviceScene, across: tuple[Scalar, Scalar], energy: Scalar) -> FootprintRays:
-    """Send rays through the points `across` the beam, which carry the fractions `energy`."""
+def send_rays(
+    scene: DeviceScene,
+    across: tuple[Scalar, Scalar],
+    energy: Scalar,
+    *,
+    group: Int[Array, "..."] | None = None,
+    aim: Vec | None = None,
+) -> FootprintRays:
+    """Send rays through the points `across` the beam, which carry the fractions `energy`.
+
+    `group`, `aim`: see `FootprintRays`; default None.
+    """
     beam, config = scene.beam, scene.config
     point, w, excess = beam.ray(across)
+    point = point if aim is None else add(point, aim)
     start_distance = scene.limits.start_distance
     x = along(point, w, jnp.asarray(-start_distance, energy.dtype))
     distances, mesh_normal = surface_distances(scene, x, w)
@@ -163,7 +182,7 @@ def send_rays(scene: DeviceScene, across: tuple[Scalar, Scalar], energy: Scalar)
     for surface, distance in zip(scene.surfaces, distances):
         # Nothing behind a triangle is lit by the ray.
         end = jnp.minimum(end, distance) if surface.is_mesh else end
-    return FootprintRays(x, w, excess - start_distance, energy, distances, end, mesh_normal)
+    return FootprintRays(x, w, excess - start_distance, energy, distances, end, mesh_normal, group, aim)
 
 
 def march_rays(scene: DeviceScene, rays: FootprintRays) -> tuple[RaySegments, list[Scalar], Scalar]:
@@ -180,16 +199,16 @@ def march_rays(scene: DeviceScene, rays: FootprintRays) -> tuple[RaySegments, li
 
 
 class _FirstOrderTally(NamedTuple):
-    """Sums over rays while they are deposited, in rows (axis `entries`): materials times histories.
+    """Sums over rays while they are deposited, in rows (axis `entries`): see `FirstOrderTracer.row`.
 
-    `returned`: by row and padded bin. `arrived`, `scattered`: by row. `escaped`: by history. `slopes`:
-    derivatives of `returned`, or None.
+    `returned`: by row and padded bin. `arrived`, `scattered`: by row. `escaped`: by history, or by group.
+    `slopes`: derivatives of `returned`, or None.
     """
 
     returned: Float[Array, "entries padded"]
     arrived: Float[Array, "entries"]
     scattered: Float[Array, "entries"]
-    escaped: Float[Array, "histories"]
+    escaped: Float[Array, "escapes"]
     slopes: Float[Array, "entries padded parameters"] | None
 
     @property
@@ -213,10 +232,13 @@ class FirstOrderTracer:
 
     With `mirror`, the rays carry what that surface returns of them (see `jaxlidar.trace.mirror_return`), and
     nothing else is deposited.
+
+    Rays of `n_groups` groups, numbered by `FootprintRays.group`, have rows of their own. These have no
+    histories: without plates, all that a material returns has one, and what arrives has none.
     """
 
-    def __init__(self, scene: DeviceScene, mirror: int | None = None):
-        self.scene, self.mirror = scene, mirror
+    def __init__(self, scene: DeviceScene, mirror: int | None = None, n_groups: int | None = None):
+        self.scene, self.mirror, self.n_groups = scene, mirror, n_groups
         self.one_passage = PlateTransmission(scene.surfaces, scene.config, 1)
         self.two_passages = PlateTransmission(scene.surfaces, scene.config, 2)
         self.kappa = 1.0 if scene.config.hotspot else 2.0
@@ -227,10 +249,20 @@ class FirstOrderTracer:
         return len(self.scene.config.materials), self.scene.first_histories.count
 
     def trace_chunk(self, across: tuple[Scalar, Scalar], energy: Scalar) -> ChunkTally:
-        """Trace a chunk of rays by the five steps of `first_order`."""
-        scene, config, slopes = self.scene, self.scene.config, self.scene.slopes
+        """Trace a chunk of rays, and sum what they return."""
+        scene = self.scene
+        tally = self.trace_rays(send_rays(scene, across, energy))
+        if tally.slopes is not None:
+            bins = scene.bins
+            inside = tally.slopes[:, bins.max_span : bins.max_span + bins.count]
+            tally = tally._replace(slopes=inside.reshape(*self.shape, bins.count, -1))
+        arrived, scattered = tally.arrived.reshape(self.shape), tally.scattered.reshape(self.shape)
+        return ChunkTally(tally.returned, arrived, scattered, tally.escaped, tally.slopes)
+
+    def trace_rays(self, rays: FootprintRays) -> _FirstOrderTally:
+        """Trace rays that have been sent, by the steps of `first_order`."""
+        scene, slopes, energy = self.scene, self.scene.slopes, rays.energy
         # Step 1.
-        rays = send_rays(scene, across, energy)
         depth_at_surfaces = [jnp.zeros_like(energy) for _ in rays.surface_distances]
         total_depth, slopes_at_surfaces = jnp.zeros_like(energy), []
         tally = self.empty_tally(energy)
@@ -261,19 +293,16 @@ class FirstOrderTracer:
                 tally = tally._replace(slopes=jnp.swapaxes(smooth, 1, 2))
         # Steps 4 and 5.
         tally = self.deposit_surfaces(tally, rays, depth_at_surfaces, slopes_at_surfaces)
-        tally = self.add_escape(tally, rays, total_depth)
-        if tally.slopes is not None:
-            bins = scene.bins
-            inside = tally.slopes[:, bins.max_span : bins.max_span + bins.count]
-            tally = tally._replace(slopes=inside.reshape(*self.shape, bins.count, -1))
-        shape = (len(config.materials), scene.first_histories.count)
-        arrived, scattered = tally.arrived.reshape(shape), tally.scattered.reshape(shape)
-        return ChunkTally(tally.returned, arrived, scattered, tally.escaped, tally.slopes)
+        return self.add_escape(tally, rays, total_depth)
 
     def empty_tally(self, energy: Scalar) -> _FirstOrderTally:
         """Return a tally of zeros for rays with these fractions of the energy."""
         scene, (n_materials, n_histories) = self.scene, self.shape
-        n_rows, padded = n_materials * n_histories, scene.bins.padded
+        # Numbers of rows of materials, and of what escapes.
+        n_rows, n_escaped = n_materials * n_histories, n_histories
+        if self.n_groups is not None:
+            n_rows, n_escaped = self.n_groups * n_materials, self.n_groups
+        padded = scene.bins.padded
         return_slopes = None
         if scene.slopes is not None:
             return_slopes = jnp.zeros((n_rows, padded, scene.slopes.count), energy.dtype)
@@ -281,16 +310,25 @@ class FirstOrderTracer:
             returned=jnp.zeros((n_rows, padded), energy.dtype),
             arrived=jnp.zeros((n_rows,), energy.dtype),
             scattered=jnp.zeros((n_rows,), energy.dtype),
-            escaped=jnp.zeros((n_histories,), energy.dtype),
+            escaped=jnp.zeros((n_escaped,), energy.dtype),
             slopes=return_slopes,
         )
         return vary_with(tally, scene)
+
+    def row(
+        self, material: int, history: Int[Array, "..."] | int, rays: FootprintRays
+    ) -> Int[Array, "..."] | int:
+        """Return the row of a material and a history in a tally; an integer where it is that of all rays."""
+        n_materials, n_histories = self.shape
+        if rays.group is None:
+            return material * n_histories + history
+        return rays.group * n_materials + material
 
     def seen_energy(self, rays: FootprintRays) -> Scalar:
         """Return what the receiver sees of rays, at the ground or at the reference plane."""
         # One fraction for all of a ray: beams are narrow in angle.
         end = jnp.minimum(rays.end, self.scene.limits.start_distance)
-        return rays.energy * self.scene.beam.in_view(along(rays.x, rays.w, end))
+        return rays.energy * self.scene.beam.in_view(rays.from_aim(along(rays.x, rays.w, end)))
 
     # Materials are deposited one after the other, so that each has its own histories and intensity factor.
     def deposit_segments(
@@ -311,7 +349,7 @@ class FirstOrderTracer:
         4. Add the energy that arrives, k_m times the integral of exp(-tau) ds.
         """
         scene, bins, config, kappa = self.scene, self.scene.bins, self.scene.config, self.kappa
-        histories, (_, n_histories) = scene.first_histories, self.shape
+        histories = scene.first_histories
         leaf_material = -1 if config.leaf is None else config.leaf.material
         assert scene.medium is not None
         (returned, arrived, return_slopes), (rays, seen_energy) = tally.of_medium, per_ray
@@ -328,7 +366,7 @@ class FirstOrderTracer:
             value = material.extinction * (material.intensity_factor * seen_energy)
             scattered_history = int(histories.next_history[0, material.channel])
             for history, factor in self.two_passages.terms(histories, scattered_history, middle, distances):
-                tally_row = jnp.broadcast_to(m * n_histories + history, first_bin.shape)
+                tally_row = jnp.broadcast_to(self.row(m, history, rays), first_bin.shape)
                 # Optimisation barriers: fused, the factor would be computed again for each piece, out of
                 # order.
                 row = once(pieces * once(value * factor)[None])
@@ -349,7 +387,7 @@ class FirstOrderTracer:
                     return_slopes = add_parameter_rows(return_slopes, tally_row, first_bin, rows)
             for history, factor in self.one_passage.terms(histories, 0, middle, distances):
                 weight = material.extinction * attenuated_length * factor * rays.energy
-                arrived = _add(arrived, m * n_histories + history, weight)
+                arrived = _add(arrived, self.row(m, history, rays), weight)
         return tally._replace(returned=returned, arrived=arrived, slopes=return_slopes)
 
     def deposit_surfaces(
@@ -365,8 +403,8 @@ class FirstOrderTracer:
         functions.
         """
         scene, bins, config, mirror = self.scene, self.scene.bins, self.scene.config, self.mirror
-        histories, (_, n_histories) = scene.first_histories, self.shape
-        x, w, excess, energy, distances, end, mesh_normal = rays
+        histories = scene.first_histories
+        x, w, excess, energy, distances, end, mesh_normal, *_ = rays
         returned, arrived, scattered, _, return_slopes = tally
         for i, (surface, scatterer) in enumerate(zip(scene.surfaces, config.surfaces)):
             if mirror is not None and i != mirror:
@@ -377,7 +415,7 @@ class FirstOrderTracer:
             normal, back = surface.lit_normal(point, w, mesh_normal), scale(w, jnp.asarray(-1.0))
             for history, factor in self.one_passage.terms(histories, 0, distances[i], distances):
                 weight = hit_energy * jnp.exp(-depth_at_surfaces[i]) * factor
-                tally_row = scatterer.material * n_histories + history
+                tally_row = self.row(scatterer.material, history, rays)
                 arrived = _add(arrived, tally_row, weight)
                 # What a law does not reflect per unit reflectance is absorbed, not scattered.
                 albedo = surface.scale_by_pattern(point, surface.law.albedo(w, normal))
@@ -386,12 +424,11 @@ class FirstOrderTracer:
                 continue
             # A plate may lie far above the ground, where the field of view is narrower: it is taken at the
             # point itself.
-            seen = surface.scale_by_pattern(point, scene.beam.in_view(point))
+            from_aim = rays.from_aim(point)
+            seen = surface.scale_by_pattern(point, scene.beam.in_view(from_aim))
             if mirror is None:
-                seen = (
-                    surface.law.intensity_factor(w, normal, back, scene.beam.aperture_half_angle(point))
-                    * seen
-                )
+                half_angle = scene.beam.aperture_half_angle(from_aim)
+                seen = surface.law.intensity_factor(w, normal, back, half_angle) * seen
             # FAR would overflow when it is converted to bins.
             time = 2.0 * (excess + jnp.minimum(distances[i], 1e9)) / SPEED_OF_LIGHT
             first_bin, row = bspline_row(
@@ -400,7 +437,7 @@ class FirstOrderTracer:
             reflected_history = int(histories.next_history[0, scatterer.reflection])
             terms = self.two_passages.terms(histories, reflected_history, distances[i], distances)
             for history, factor in terms:
-                tally_row = jnp.broadcast_to(scatterer.material * n_histories + history, first_bin.shape)
+                tally_row = jnp.broadcast_to(self.row(scatterer.material, history, rays), first_bin.shape)
                 returned = add_rows(returned, tally_row, first_bin, row * factor[:, None])
                 if return_slopes is not None:
                     values = lax.stop_gradient(row * factor[:, None])
@@ -417,7 +454,7 @@ class FirstOrderTracer:
         unscattered = jnp.where(rays.end < FAR, 0.0, rays.energy * jnp.exp(-total_depth))
         terms = self.one_passage.terms(self.scene.first_histories, 0, rays.end, rays.surface_distances)
         for history, factor in terms:
-            escaped = _add(escaped, history, unscattered * factor)
+            escaped = _add(escaped, history if rays.group is None else rays.group, unscattered * factor)
         return tally._replace(escaped=escaped)
 
 

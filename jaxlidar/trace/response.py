@@ -240,7 +240,7 @@ def _first(
     scene: DeviceScene, key: PRNGKeyArray, ray_slice: RaySlice = ALL_RAYS
 ) -> tuple[FirstOrder, Float[Array, "materials first_histories bins"]]:
     """Trace order one; also return its weights together with the returns of mirrors."""
-    shift = _footprint_shift(scene, key)
+    shift = footprint_shift(scene, key)
     return with_replay(_first_of_shift, _pull_back_first, scene, (shift, ray_slice))
 
 
@@ -284,10 +284,11 @@ def footprint_rays(
     scene: DeviceScene, key: PRNGKeyArray, ray_slice: RaySlice = ALL_RAYS
 ) -> tuple[tuple[Float[Array, "rays"], Float[Array, "rays"]], Float[Array, "rays"]]:
     """Return the positions of the footprint's rays across the beam, and their fractions of its energy."""
-    return _footprint_rays(scene, _footprint_shift(scene, key), ray_slice)
+    return _footprint_rays(scene, footprint_shift(scene, key), ray_slice)
 
 
-def _footprint_shift(scene: DeviceScene, key: PRNGKeyArray) -> Float[Array, "2"]:
+def footprint_shift(scene: DeviceScene, key: PRNGKeyArray) -> Float[Array, "2"]:
+    """Return the random shift of a footprint's rays, as `fibonacci_disc` takes it."""
     # Shifted at random, rays are an unbiased sample of the footprint; not shifted, they are the same for
     # every key.
     is_random = scene.config.random_footprint and not scene.config.uses_quadrature
@@ -305,39 +306,12 @@ def _footprint_rays(
 def first_order_response(
     scene: DeviceScene, first: FirstOrder, weights: Float[Array, "materials first_histories bins"]
 ) -> Response:
-    """Make the response where nothing is followed beyond the first scattering.
-
-    1. For each material and channel: the light that it scatters departs with the next history.
-    2. That light remains unfollowed, unless it went straight through a plate.
-    3. What one plane alone scatters escapes, as nothing is in its path.
-    """
-    config, histories = scene.config, scene.first_histories
-    departed = jnp.zeros_like(first.arrived)
-    remaining = jnp.zeros_like(first.escaped)
-    scatterers = [(s, False) for s in (config.leaf, config.bark) if s is not None]
-    scatterers += [(s, surface.straight) for s, surface in zip(config.surfaces, scene.surfaces)]
-    for scatterer, is_straight in scatterers:
-        for channel, energy in (
-            (scatterer.reflection, first.scattered),
-            (scatterer.transmission, first.arrived),
-        ):
-            if channel < 0:
-                continue
-            after = histories.next_history[:, channel]
-            # Histories of the largest degree, which have no successor, are not scattered again.
-            scattered = jnp.where(
-                after != jnp.arange(histories.count, dtype=after.dtype), energy[scatterer.material], 0.0
-            )
-            departed = departed.at[scatterer.material, after].add(scattered)
-            # Light that goes straight through a plate was followed to what lies behind it.
-            if not (is_straight and channel == scatterer.transmission):
-                remaining = remaining.at[after].add(scattered)
-    escaped, none = first.escaped, jnp.zeros_like(remaining)
-    lights_itself = any(surface.lights_itself for surface in scene.surfaces)
-    if len(scatterers) == 1 and not (config.leaf or config.bark or lights_itself):
-        escaped, remaining = escaped + remaining, none
+    """Make the response where nothing is followed beyond the first scattering."""
+    departed, escaped, remaining = fates_after_first_scattering(
+        scene, first.arrived, first.scattered, first.escaped
+    )
     # No light is late: none is followed beyond its first scattering.
-    budget = (first.arrived, departed, escaped, none, remaining)
+    budget = (first.arrived, departed, escaped, jnp.zeros_like(remaining), remaining)
     arrived, departed, escaped, late, remaining = (a[None] for a in budget)
     return Response(
         first=weights[None],
@@ -350,3 +324,38 @@ def first_order_response(
         late=late,
         remaining=remaining,
     )
+
+
+def fates_after_first_scattering(
+    scene: DeviceScene,
+    arrived: Float[Array, "materials histories"],
+    scattered: Float[Array, "materials histories"],
+    escaped: Float[Array, "histories"],
+) -> tuple[Float[Array, "materials histories"], Float[Array, "histories"], Float[Array, "histories"]]:
+    """Return what departs from each material, what escapes, and what remains unfollowed.
+
+    1. For each material and channel: the light that it scatters departs with the next history.
+    2. That light remains unfollowed, unless it went straight through a plate.
+    3. What one plane alone scatters escapes, as nothing is in its path.
+    """
+    config, histories = scene.config, scene.first_histories
+    departed, remaining = jnp.zeros_like(arrived), jnp.zeros_like(escaped)
+    scatterers = [(s, False) for s in (config.leaf, config.bark) if s is not None]
+    scatterers += [(s, surface.straight) for s, surface in zip(config.surfaces, scene.surfaces)]
+    for scatterer, is_straight in scatterers:
+        for channel, energy in ((scatterer.reflection, scattered), (scatterer.transmission, arrived)):
+            if channel < 0:
+                continue
+            after = histories.next_history[:, channel]
+            # Histories of the largest degree, which have no successor, are not scattered again.
+            weight = jnp.where(
+                after != jnp.arange(histories.count, dtype=after.dtype), energy[scatterer.material], 0.0
+            )
+            departed = departed.at[scatterer.material, after].add(weight)
+            # Light that goes straight through a plate was followed to what lies behind it.
+            if not (is_straight and channel == scatterer.transmission):
+                remaining = remaining.at[after].add(weight)
+    lights_itself = any(surface.lights_itself for surface in scene.surfaces)
+    if len(scatterers) == 1 and not (config.leaf or config.bark or lights_itself):
+        return departed, escaped + remaining, jnp.zeros_like(remaining)
+    return departed, escaped, remaining

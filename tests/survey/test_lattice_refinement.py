@@ -1,12 +1,21 @@
 """Shots of first order: lattices of rays that are made denser until the tolerance is met."""
 
+import dataclasses
+
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import jaxlidar as jl
+from jaxlidar.survey.choose_strategy import choose_strategy
+from jaxlidar.survey.per_shot import aim_offset, setup_of_shot, shot_geometry, trace_chunk
+from jaxlidar.trace.device_scene import aim_at, build_device_scene
+from jaxlidar.trace.first_order import first_order
 from jaxlidar.trace.footprint import RaySlice, fibonacci_disc, make_beam
+from jaxlidar.trace.lattices_of_shots import trace_parts
+from tests.helpers import BY_PRECISION
 
 KEY = jax.random.key(5)
 LIDAR = jl.Lidar(altitude=1000.0, divergence=3.0, pulse=jl.GaussianPulse(fwhm=4.0))
@@ -68,3 +77,89 @@ def test_every_shot_has_the_error_that_it_reports_within_the_tolerance():
 def test_a_tolerance_out_of_reach_is_reported():
     waveforms = jl.simulate_many(shots(1), edge(), key=KEY, max_orders=1, rtol=1e-6, shared=False)
     assert 1e-6 < float(waveforms.error[0]) < 1e-3
+
+
+NARROW = jl.Lidar(altitude=1000.0, divergence=0.3, pulse=jl.GaussianPulse(fwhm=4.0))
+
+
+def narrow_shots(count: int) -> jl.Survey:
+    """Return shots of 0.3 m across the edge at x = 10 and across an edge along y."""
+    x = 10.0 + np.linspace(-0.35, 0.35, count)
+    return jl.Survey(
+        NARROW, np.stack([x, np.linspace(4.0, 15.0, count)], axis=1), np.linspace(0.0, 8.0, count)
+    )
+
+
+def terrain_under(scene: jl.Scene) -> jl.Scene:
+    heights = 0.4 * np.sin(np.arange(31)[:, None] / 3.0) + 0.3 * np.cos(np.arange(31)[None, :] / 2.0) - 0.8
+    return jl.Scene(canopy=scene.canopy, ground=jl.Terrain(heights, 1.0, (-5.0, -5.0), reflectance=0.3))
+
+
+def strategy_of(survey: jl.Survey, scene: jl.Scene):
+    return choose_strategy(survey, scene, rtol=0.2, max_orders=1, window=None, shared=None)
+
+
+@BY_PRECISION
+def test_parts_of_many_shots_are_those_of_single_ones(precision):
+    """Lattices that are traced together return what each returns alone; planted: that of another shot."""
+    strategy = strategy_of(narrow_shots(3), terrain_under(edge()))
+    setup, shots = strategy.setup, shot_geometry(strategy.survey, 0, 3).as_arrays()
+    n_rays, shifts = 8, jnp.asarray([[0.3, 0.8], [0.6, 0.1], [0.9, 0.5]])
+    slices = RaySlice(jnp.asarray([0, 1, 2]), jnp.asarray([1, 3, 4]))
+
+    @eqx.filter_jit
+    def both():
+        scene = build_device_scene(setup, derivatives="none")
+        offsets = jax.vmap(lambda shot: aim_offset(setup, shot))(shots)
+        beams = jax.vmap(lambda shot: make_beam(setup_of_shot(setup, shot).lidar))(shots)
+        aims = jnp.pad(offsets - offsets[:1], ((0, 0), (0, 1)))
+        together = trace_parts(aim_at(scene, setup.lidar, offsets[0]), beams, aims, shifts, slices, n_rays)
+
+        def alone(part):
+            shot, offset, beam, shift, ray_slice = part
+            aimed = aim_at(scene, setup_of_shot(setup, shot).lidar, offset)
+            return first_order(aimed, *fibonacci_disc(beam, n_rays, shift, ray_slice))
+
+        return together, jax.lax.map(alone, (shots, offsets, beams, shifts, slices))
+
+    together, alone = both()
+    close = {"rtol": 1e-4, "atol": 2e-6} if precision == "float32" else {"rtol": 1e-9, "atol": 1e-12}
+    for name in ("weights", "outside", "arrived", "scattered"):
+        np.testing.assert_allclose(getattr(together, name), getattr(alone, name).sum(axis=2), **close)
+    np.testing.assert_allclose(together.escaped, alone.escaped.sum(axis=1), **close)
+    assert np.abs(together.weights[0] - alone.weights[1].sum(axis=1)).max() > 0.01
+
+
+@pytest.mark.slow
+def test_narrow_shots_have_the_error_that_they_report_within_the_tolerance():
+    """Few rays first, and more for shots that need them; two wavelengths."""
+    lidar = dataclasses.replace(NARROW, wavelength=[900.0, 1550.0])
+    x = 10.0 + np.linspace(-0.35, 0.35, 24)
+    survey = jl.Survey(lidar, np.stack([x, np.linspace(4.0, 15.0, 24)], axis=1))
+    scene, rtol = terrain_under(edge()), 0.1
+    waveforms = jl.simulate_many(survey, scene, key=KEY, max_orders=1, rtol=rtol)
+    assert np.all(waveforms.error <= rtol)
+    assert np.any(waveforms.error > 0.1 * rtol)
+    exact = jl.simulate_many(survey, scene, key=jax.random.key(6), max_orders=1, rtol=0.02)
+
+    def worst(waveforms: jl.Waveforms) -> float:
+        """Return the largest relative error of a shot, in the root mean square over its samples."""
+        square = np.mean(
+            (np.asarray(waveforms.reflectance) - np.asarray(exact.reflectance)) ** 2, axis=(1, 2)
+        )
+        return float(np.sqrt(square / np.mean(np.asarray(exact.reflectance) ** 2, axis=(1, 2))).max())
+
+    assert 1e-4 < worst(waveforms) < 1.5 * rtol
+    # Planted: a crown thinner by a layer.
+    wrong = terrain_under(edge(2.0))
+    assert worst(jl.simulate_many(survey, wrong, key=KEY, max_orders=1, rtol=rtol)) > 3.0 * rtol
+
+
+@pytest.mark.slow
+def test_results_do_not_depend_on_which_shots_are_traced_together():
+    strategy = strategy_of(narrow_shots(20), edge())
+    chunks = [shot_geometry(strategy.survey, first, count) for first, count in ((0, 20), (3, 9))]
+    all_shots, some = (trace_chunk(strategy.setup, chunk, 0.1, KEY) for chunk in chunks)
+    assert np.ptp(np.asarray(all_shots.error)) > 0
+    np.testing.assert_allclose(all_shots.reflectance[3:12], some.reflectance, rtol=1e-3, atol=1e-6)
+    np.testing.assert_allclose(all_shots.error[3:12], some.error, rtol=1e-2, atol=1e-5)
