@@ -40,7 +40,8 @@ def gradient(scene_lad: np.ndarray, observed: jl.Waveform) -> Array:
 
 
 def main(folder: Path) -> None:
-    """Write the results of the tour to a folder."""
+    """Write the results of the tour to a folder, which is made if it does not exist."""
+    folder.mkdir(parents=True, exist_ok=True)
     lad = np.full((4, 4, 4), 0.5)
     scene = scene_of(lad)
     print(jl.plan(LIDAR, scene, rtol=0.1, max_orders=1))
@@ -60,7 +61,7 @@ def main(folder: Path) -> None:
     values: dict[str, float] = {name: float(value) for name, value in fit.values.items()}
     print(values, fit.stderr["Cab"], fit.status)
 
-    survey = jl.Survey(LIDAR, position=np.array([(0.0, 0.0), (1.0, 2.0)]), zenith=[0.0, 5.0])
+    survey = jl.Survey(LIDAR, position=np.array([(0.0, 0.0), (1.0, 1.0)]), zenith=[0.0, 5.0])
     many = jl.simulate_many(survey, scene, key=KEY, rtol=0.2, max_orders=1)
     first: jl.Waveform = many[0]
     print(len(many), many.reflectance.shape, first.height[:2])

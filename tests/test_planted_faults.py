@@ -65,8 +65,8 @@ FAULTS = {
     ),
     "half a bin": Fault(
         "trace/ray_segments.py",
-        "end = jnp.clip(first_number + (j + 0.5)",
-        "end = jnp.clip(first_number + (j + 1.0)",
+        "jnp.minimum(first_number + 0.5, end_position)",
+        "jnp.minimum(first_number + 1.0, end_position)",
         "trace/test_slab_first_order.py",
     ),
     "deposits half a bin late": Fault(

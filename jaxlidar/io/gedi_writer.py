@@ -95,7 +95,7 @@ def write_gedi_l1b(
     origin: tuple[float, float] | None = None,
     crs: str | None = None,
     elevation: ArrayLike | Sequence = 0.0,
-    beam: str | Sequence[str] = "BEAM0101",
+    beam: str | Sequence[str] | np.ndarray = "BEAM0101",
     shot_number: Sequence[int] | np.ndarray | None = None,
     margin: int = 200,
     gain: float = 50_000.0,

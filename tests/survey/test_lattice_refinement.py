@@ -108,21 +108,21 @@ def test_parts_of_many_shots_are_those_of_single_ones(precision):
     slices = RaySlice(jnp.asarray([0, 1, 2]), jnp.asarray([1, 3, 4]))
 
     @eqx.filter_jit
-    def both():
+    def trace_by_both_ways():
         scene = build_device_scene(setup, derivatives="none")
         offsets = jax.vmap(lambda shot: aim_offset(setup, shot))(shots)
         beams = jax.vmap(lambda shot: make_beam(setup_of_shot(setup, shot).lidar))(shots)
         aims = jnp.pad(offsets - offsets[:1], ((0, 0), (0, 1)))
         together = trace_parts(aim_at(scene, setup.lidar, offsets[0]), beams, aims, shifts, slices, n_rays)
 
-        def alone(part):
-            shot, offset, beam, shift, ray_slice = part
+        def trace_alone(lattice):
+            shot, offset, beam, shift, ray_slice = lattice
             aimed = aim_at(scene, setup_of_shot(setup, shot).lidar, offset)
             return first_order(aimed, *fibonacci_disc(beam, n_rays, shift, ray_slice))
 
-        return together, jax.lax.map(alone, (shots, offsets, beams, shifts, slices))
+        return together, jax.lax.map(trace_alone, (shots, offsets, beams, shifts, slices))
 
-    together, alone = both()
+    together, alone = trace_by_both_ways()
     close = {"rtol": 1e-4, "atol": 2e-6} if precision == "float32" else {"rtol": 1e-9, "atol": 1e-12}
     for name in ("weights", "outside", "arrived", "scattered"):
         np.testing.assert_allclose(getattr(together, name), getattr(alone, name).sum(axis=2), **close)
@@ -159,7 +159,7 @@ def test_narrow_shots_have_the_error_that_they_report_within_the_tolerance():
 def test_results_do_not_depend_on_which_shots_are_traced_together():
     strategy = strategy_of(narrow_shots(20), edge())
     chunks = [shot_geometry(strategy.survey, first, count) for first, count in ((0, 20), (3, 9))]
-    all_shots, some = (trace_chunk(strategy.setup, chunk, 0.1, KEY) for chunk in chunks)
+    all_shots, nine_shots = (trace_chunk(strategy.setup, chunk, 0.1, KEY) for chunk in chunks)
     assert np.ptp(np.asarray(all_shots.error)) > 0
-    np.testing.assert_allclose(all_shots.reflectance[3:12], some.reflectance, rtol=1e-3, atol=1e-6)
-    np.testing.assert_allclose(all_shots.error[3:12], some.error, rtol=1e-2, atol=1e-5)
+    np.testing.assert_allclose(all_shots.reflectance[3:12], nine_shots.reflectance, rtol=1e-3, atol=1e-6)
+    np.testing.assert_allclose(all_shots.error[3:12], nine_shots.error, rtol=1e-2, atol=1e-5)
