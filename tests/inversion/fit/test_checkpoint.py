@@ -20,6 +20,8 @@ from jaxlidar.io.checkpoint import open_checkpoint
 from tests.inversion.fit.test_fingerprint import PROBLEM, TIME, unknowns
 from tests.io.test_checkpoint import UNWRITABLE, unwritable
 
+ROOT = Path(__file__).resolve().parents[3]
+
 # -- records of fits -------------------------------------------------------------------------------------
 
 SIZES = SummarySizes(unknowns=2, smooth_priors=0, wavelengths=1, bins=30)
@@ -172,13 +174,23 @@ def stored_numbers(path):
     return numbers
 
 
+# Another process runs this, with programs compiled as here: results are the same to the last bit.
+KILLED_RUN = """
+from tests.quick_compilation import optimise_programs
+
+optimise_programs()
+
+import tests.inversion.fit.test_checkpoint as t
+
+t.run({path!r}, t.wait_after_three)
+"""
+
+
 @pytest.mark.slow
 def test_a_run_that_was_killed_goes_on(tmp_path, monkeypatch):
     path = tmp_path / "fits.sqlite"
-    code = f"import test_checkpoint as t; t.run({str(path)!r}, t.wait_after_three)"
-    process = subprocess.Popen(
-        [sys.executable, "-c", code], cwd=Path(__file__).parent, stdout=subprocess.PIPE, text=True
-    )
+    code = KILLED_RUN.format(path=str(path))
+    process = subprocess.Popen([sys.executable, "-c", code], cwd=ROOT, stdout=subprocess.PIPE, text=True)
     try:
         assert [process.stdout.readline().strip() for _ in range(3)] == ["1", "2", "3"]
         with pytest.raises(OSError, match="is in use by another run"):

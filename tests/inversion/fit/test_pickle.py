@@ -12,6 +12,7 @@ import inversion
 import jaxlidar as jl
 from inversion import LogNormal, Unknown
 from inversion.fit.unknowns import bind_unknowns
+from tests.quick_compilation import optimise_programs
 
 SCENE = jl.Scene(
     canopy=jl.Canopy(
@@ -89,7 +90,7 @@ def test_a_spawned_process_gives_the_same_retrieval():
     """Problem and result are both sent. Spawned, as a process forked after JAX was used may wait for ever."""
     scene = jl.Scene(ground=jl.Ground(height=0.1, reflectance=0.3))
     wave = jl.simulate(jl.Lidar(), scene, key=jax.random.key(0))
-    with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as pool:
+    with ProcessPoolExecutor(1, multiprocessing.get_context("spawn"), optimise_programs) as pool:
         from_worker = pool.submit(retrieve, wave, unknowns()).result(timeout=300)
     from_this_process = retrieve(wave, unknowns())
     assert from_worker.status == from_this_process.status
