@@ -393,12 +393,12 @@ def _impulse(file: ProductFile, beam: str) -> PhotonImpulse | None:
     """
     spots = {1: "pce1_spot1", 3: "pce2_spot3"}
     table = "ancillary_data/tep/tep_valid_spot"
-    with_attributes = file.file[beam].attrs
-    if not file.has(table) or "atlas_spot_number" not in with_attributes:
+    spot = file.attribute(beam, "atlas_spot_number") if file.has(table) else None
+    if spot is None:
         return None
-    text = text_of_attribute(with_attributes["atlas_spot_number"])
+    text = text_of_attribute(spot)
     serving = _whole_numbers(file.numbers(table, _PHOTONS))
-    if not text.isdigit() or not 1 <= int(text) <= serving.size:
+    if not text.isdecimal() or not 1 <= int(text) <= serving.size:
         return None
     group = f"atlas_impulse_response/{spots.get(int(serving[int(text) - 1]))}/tep_histogram"
     if not (file.has(f"{group}/tep_hist") and file.has(f"{group}/tep_hist_time")):

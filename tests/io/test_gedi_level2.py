@@ -96,3 +96,22 @@ def test_of_many_thicknesses_of_layers_one_is_read(tmp_path):
     tracemalloc.stop()
     assert table.columns["pavd_z"].axis.values[:3].tolist() == [0.0, 5.0, 10.0]
     assert peak < 2**24
+
+
+@pytest.mark.parametrize("at", [0, 24])
+def test_texts_in_a_damaged_heap_are_refused(tmp_path, at):
+    path = write_level_2(tmp_path / "a.h5", "2A")
+    content = bytearray(path.read_bytes())
+    # Of the first text, or of what is free behind two: HDF5 stays at an object of number 0 and size 0.
+    heap = content.index(b"GCOL") + 16 + at
+    content[heap : heap + 48] = bytes(48)
+    path.write_bytes(content)
+    with pytest.raises(ValueError, match=r"a\.h5: /BEAM0000/geolocation/rh_a2: damaged \(the heap at byte"):
+        read_gedi_l2a(path)
+
+
+def test_texts_are_read_through_links_to_other_files(tmp_path):
+    write_level_2(tmp_path / "a.h5", "2A")
+    with h5py.File(tmp_path / "links.h5", "w") as file:
+        file["BEAM0000"] = h5py.ExternalLink("a.h5", "/BEAM0000")
+    assert np.all(read_gedi_l2a(tmp_path / "links.h5")["rh_a2"] == 2.5)
