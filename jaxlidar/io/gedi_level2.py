@@ -22,6 +22,8 @@ _FILL = -9999.0
 _GROUPS = range(1, 7)
 # Height of the layers of level 2B in m, where the file does not say.
 _LAYER_THICKNESS = 5.0
+# Largest thickness in m that a file may state: no layer is thicker than the air.
+_MAX_LAYER_THICKNESS = 1e5
 
 
 class _Field(NamedTuple):
@@ -233,7 +235,10 @@ def _read_beam(
 
 
 def _axis(file: ProductFile, beam: str, field: _Field, values: np.ndarray) -> ColumnAxis | None:
-    """Return the second axis of a column: percentiles, or heights of layers above the ground."""
+    """Return the second axis of a column: percentiles, or heights of layers above the ground.
+
+    **Raises:** ValueError for a thickness of layers that is none.
+    """
     if field.levels is None:
         return None
     levels = np.arange(values.shape[1], dtype=float)
@@ -241,7 +246,15 @@ def _axis(file: ProductFile, beam: str, field: _Field, values: np.ndarray) -> Co
         return ColumnAxis(field.levels, levels * 100.0 / max(levels.size - 1, 1), "percent")
     thickness, name = _LAYER_THICKNESS, f"{beam}/ancillary/dz"
     if file.has(name):
-        thickness = float(file.numbers(name, "GEDI L2B")[0])
+        # One number is in use, however many the file has.
+        stated = file.numbers(name, "GEDI L2B", rows=slice(1))
+        # Written so that NaN is refused.
+        if stated.size == 0 or not 0 < stated[0] <= _MAX_LAYER_THICKNESS:
+            raise ValueError(
+                f"{file.location(name)}: {stated.tolist()} is no thickness of layers; admissible is one in "
+                f"(0, {_MAX_LAYER_THICKNESS:g}] m"
+            )
+        thickness = float(stated[0])
     return ColumnAxis(field.levels, levels * thickness, "m")
 
 

@@ -2,11 +2,19 @@
 
 HDF5 answers for what a file does not hold with zeros, and for what it declares with memory. So a dataset is
 read only if it has numbers, its chunks are all stored, and its size is plausible for the size of the file.
+
+**Texts.** Attributes that are texts of variable length lie in global heaps. HDF5 goes through a heap from
+object to object, by the sizes that they state. At a step of no length, as over zeros, it stays for ever, in
+compiled code that no signal interrupts (found with HDF5 2.0). So such attributes are read through a stream
+that refuses heaps like that. Only they are: a stream of Python is slower than HDF5's own.
 """
 
 import contextlib
+import functools
+import io
 import math
 import os
+import re
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -21,6 +29,13 @@ from jaxlidar.io.coordinates import units_agree
 _STORED_AS_COUNTS = {"scale_factor": 1.0, "add_offset": 0.0}
 # The attribute of a dataset with the value that stands for a missing one.
 _FILL_ATTRIBUTE = "_FillValue"
+# First bytes of a global heap, which its size follows: the signature, version 1, three bytes that are kept.
+_HEAP = b"GCOL\x01\0\0\0"
+# First bytes of an object of a heap, which its size follows; number 0 is what is free. Both are kept to
+# multiples of these bytes.
+_OBJECT_SIZE_OFFSET = _HEAP_ALIGNMENT = 8
+# Kinds of the types of attributes that do not lie in heaps: numbers, and text of a fixed length.
+_PLAIN_KINDS = "biufS"
 
 
 @contextlib.contextmanager
@@ -38,17 +53,27 @@ def open_hdf5(path: str | os.PathLike[str]) -> Iterator["ProductFile"]:
     with contextlib.ExitStack() as stack:
         with refuse_damage(f"{path}: not a readable HDF5 file"):
             file = stack.enter_context(h5py.File(path, "r"))
-        yield ProductFile(path, file)
+        yield ProductFile(path, file, stack)
 
 
 class ProductFile:
     """An open HDF5 file of a product, whose datasets are checked before they are read.
 
     - `path`, `file`: the path, and the `h5py.File`.
+    - `stack`: of what is closed with the file.
     """
 
-    def __init__(self, path: Path, file: Any):
-        self.path, self.file = path, file
+    def __init__(self, path: Path, file: Any, stack: contextlib.ExitStack):
+        self.path, self.file, self._stack = path, file, stack
+
+    @functools.cached_property
+    def _checked_file(self) -> Any:
+        """The same file, whose heaps are checked as they are read."""
+        import h5py
+
+        _, size_of_lengths = self.file.id.get_create_plist().get_sizes()
+        stream = self._stack.enter_context(_CheckedHeapStream(self.path, size_of_lengths))
+        return self._stack.enter_context(h5py.File(stream, "r"))
 
     def location(self, name: str) -> str:
         """Return the location of a dataset or group, for messages."""
@@ -89,11 +114,6 @@ class ProductFile:
         with refuse_damage(f"{location}: damaged"):
             # HDF5 returns zeros for what is not stored, as many as are declared.
             is_elsewhere = node.is_virtual or node.external
-            packed = [
-                attribute
-                for attribute, usual in _STORED_AS_COUNTS.items()
-                if node.attrs.get(attribute, usual) != usual
-            ]
             chunk = node.chunks or shape
             chunks = math.prod(math.ceil(size / part) if part else 0 for size, part in zip(shape, chunk))
             contiguous = node.id.get_storage_size() // max(node.nbytes, 1)
@@ -103,10 +123,26 @@ class ProductFile:
                 f"{location}: {math.prod(shape)} numbers are declared, but the file holds {stored} of "
                 f"{chunks} parts of them"
             )
+        stated = {attribute: self.attribute(name, attribute) for attribute in _STORED_AS_COUNTS}
+        packed = [key for key, usual in _STORED_AS_COUNTS.items() if stated[key] not in (None, usual)]
         if packed:
             raise ValueError(f"{location}: {', '.join(packed)}: counts, which are not read")
         check_unpacked_size(self.path, f"/{name}", chunks * math.prod(chunk) * node.dtype.itemsize)
         return node
+
+    def attribute(self, name: str, key: str) -> Any:
+        """Return an attribute of a dataset or group; None where it has none.
+
+        **Raises:** ValueError, naming the file and the dataset, where it is damaged.
+        """
+        with refuse_damage(f"{self.location(name)}: damaged"):
+            node = self.file[name]
+            if key not in node.attrs:
+                return None
+            is_plain = node.attrs.get_id(key).dtype.kind in _PLAIN_KINDS
+            # A link may lead to another file.
+            is_here = node.file.filename == self.file.filename
+            return (self._checked_file[node.name] if is_here and not is_plain else node).attrs[key]
 
     def read(self, name: str, product: str, ndim: int = 1, rows: Any = slice(None)) -> np.ndarray:
         """Return the stored numbers of a dataset, or of some of its rows. **Raises:** as `dataset`."""
@@ -119,8 +155,7 @@ class ProductFile:
     ) -> Float[np.ndarray, "..."]:
         """Return numbers in double precision; NaN where they are the dataset's fill value."""
         values = self.read(name, product, ndim, rows)
-        with refuse_damage(f"{self.location(name)}: damaged"):
-            fill = self.file[name].attrs.get(_FILL_ATTRIBUTE)
+        fill = self.attribute(name, _FILL_ATTRIBUTE)
         is_fill = np.zeros(values.shape, bool) if fill is None else np.isin(values, fill)
         with np.errstate(over="ignore", invalid="ignore"):
             return np.where(is_fill, np.nan, values.astype(np.float64))
@@ -137,14 +172,63 @@ class ProductFile:
         **Arguments:** `read_unit`: `unit_length` or `unit_angle`. `size`: of the unit that is returned, in m
         or rad.
         """
-        with refuse_damage(f"{self.location(name)}: damaged"):
-            attributes = self.file[name].attrs
-            stated = next((attributes[key] for key in ("units", "unit") if key in attributes), None)
+        stated = self.attribute(name, "units")
+        if stated is None:
+            stated = self.attribute(name, "unit")
         if stated is None:
             return values
         text = text_of_attribute(stated)
         unit = read_unit(self.location(name), text)
         return values if unit is None or units_agree(unit, size) else values * (unit / size)
+
+
+class _CheckedHeapStream(io.FileIO):
+    """A file from which HDF5 reads no global heap in which it would stay for ever.
+
+    **Raises:** OSError where one is read.
+    """
+
+    def __init__(self, path: Path, size_of_lengths: int):
+        super().__init__(path, "rb")
+        self._size_of_lengths = size_of_lengths
+
+    def readinto(self, buffer: Any, /) -> int | None:
+        start, count = self.tell(), super().readinto(buffer)
+        # HDF5 keeps bytes that it has read and reads the others: those of a heap may come in parts.
+        first = max(start - len(_HEAP) + 1, 0)
+        self.seek(first)
+        content = self.read(start - first + (count or 0) + len(_HEAP) - 1)
+        for match in re.finditer(re.escape(_HEAP), content):
+            self._check_heap(first + match.start())
+        self.seek(start + (count or 0))
+        return count
+
+    def _check_heap(self, start: int) -> None:
+        """Go through the objects of a heap as HDF5 does. **Raises:** OSError at a step of no length."""
+        length = self._size_of_lengths
+        header = _aligned(_OBJECT_SIZE_OFFSET + length)
+        self.seek(start + len(_HEAP))
+        size = int.from_bytes(self.read(length), "little")
+        self.seek(start)
+        # HDF5 refuses a heap that is longer than the file, and an object that is longer than the heap.
+        heap = self.read(min(size, os.fstat(self.fileno()).st_size))
+        position = header
+        while position + header <= len(heap):
+            number = int.from_bytes(heap[position : position + 2], "little")
+            size_start = position + _OBJECT_SIZE_OFFSET
+            size = int.from_bytes(heap[size_start : size_start + length], "little")
+            # Sums overflow as those of HDF5 do.
+            step = (header + _aligned(size) if number else size) % 2**64
+            if step == 0:
+                raise OSError(
+                    f"the heap at byte {start} has an object of no length at byte {start + position}"
+                )
+            position += step
+
+
+def _aligned(size: int) -> int:
+    """Return the size of what is kept to a multiple of the alignment of heaps."""
+    return -(-size // _HEAP_ALIGNMENT) * _HEAP_ALIGNMENT
 
 
 def text_of_attribute(attribute: Any) -> str:

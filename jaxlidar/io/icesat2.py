@@ -199,9 +199,9 @@ def read_atl03(
             field = f"{beam}/geolocation/{name}"
             if not needed and not file.has(field):
                 return np.full(count.shape, np.nan)
-            return _without_fills(file.numbers(field, _PHOTONS))
+            return _without_fills(_rows_of(file, field, count.size, "segment_ph_cnt"))
 
-        count = segments_of("segment_ph_cnt")
+        count = _without_fills(file.numbers(f"{beam}/geolocation/segment_ph_cnt", _PHOTONS))
         start = segments_of("segment_dist_x")
         latitudes = segments_of("reference_photon_lat", needed=False)
         is_chosen = np.abs(start) <= MAX_COORDINATE
@@ -216,14 +216,15 @@ def read_atl03(
                 f"{file.location(beam)}: none of its {start.size} segments lies in stretch = {stretch}, "
                 f"latitude = {latitude}"
             )
-        first_photon = _first_photons(file, beam, count)
+        photons = int(file.dataset(f"{beam}/heights/h_ph", _PHOTONS).shape[0])
+        first_photon = _first_photons(file, beam, count, photons)
         # Segments follow one another in a file: one range of rows holds the photons of all.
         run = np.arange(chosen[0], chosen[-1] + 1)
         rows = slice(int(first_photon[run[0]]), int(first_photon[run[-1]] + count[run[-1]]))
         segment = np.repeat(run, count[run].astype(int))
 
-        def photons_of(name: str, ndim: int = 1) -> np.ndarray:
-            return file.numbers(f"{beam}/heights/{name}", _PHOTONS, ndim, rows)
+        def photons_of(name: str, columns: int | None = None) -> np.ndarray:
+            return _rows_of(file, f"{beam}/heights/{name}", photons, "h_ph", rows=rows, columns=columns)
 
         height, along = _without_fills(photons_of("h_ph")), _without_fills(photons_of("dist_ph_along"))
         # Written so that NaN is left out.
@@ -236,11 +237,13 @@ def read_atl03(
                 "or no distance: they are left out"
             )
         time = photons_of("delta_time")
-        confidence = photons_of("signal_conf_ph", 2)[:, SURFACES.index(surface)]
+        confidence = photons_of("signal_conf_ph", len(SURFACES))[:, SURFACES.index(surface)]
         quality = (
             photons_of("quality_ph") if file.has(f"{beam}/heights/quality_ph") else np.zeros(height.size)
         )
-        pulse = _pulses(file, beam, rows, time)
+        names = ("pce_mframe_cnt", "ph_id_pulse")
+        has_pulses = all(file.has(f"{beam}/heights/{name}") for name in names)
+        pulse = _pulses(*map(photons_of, names)) if has_pulses else _pulses_by_time(time)
         background = _background_rate(file, beam, time)
         width = segments_of("tx_pulse_width_lower", needed=False)
         places = {name: photons_of(field)[is_complete] for name, field in _PLACES.items()}
@@ -287,6 +290,30 @@ def _beam(file: ProductFile, beam: str | None, group: str, product: str) -> str:
     return beam
 
 
+def _rows_of(
+    file: ProductFile,
+    name: str,
+    length: int,
+    of: str,
+    *,
+    rows: slice = slice(None),
+    columns: int | None = None,
+) -> np.ndarray:
+    """Return numbers, or those of some rows, of a dataset of `length` rows, as many as that named `of` has.
+
+    **Arguments:** `columns`: that it has. None: it has one dimension.
+
+    **Raises:** ValueError for another shape, and as `ProductFile.numbers`.
+    """
+    ndim, admissible = (1, (length,)) if columns is None else (2, (length, columns))
+    shape = file.dataset(name, _PHOTONS, ndim).shape
+    if shape != admissible:
+        raise ValueError(
+            f"{file.location(name)}: shape {shape}; admissible is {admissible}: {of} has {length} rows"
+        )
+    return file.numbers(name, _PHOTONS, ndim, rows)
+
+
 def _without_fills(values: np.ndarray) -> np.ndarray:
     """Return numbers with NaN in place of the largest ones of their type, which stand for missing ones."""
     with np.errstate(invalid="ignore"):
@@ -299,15 +326,16 @@ def _whole_numbers(values: np.ndarray) -> np.ndarray:
     return np.where(is_whole, values, _NO_INTEGER).astype(np.int64)
 
 
-def _first_photons(file: ProductFile, beam: str, count: np.ndarray) -> np.ndarray:
+def _first_photons(file: ProductFile, beam: str, count: np.ndarray, size: int) -> np.ndarray:
     """Return the row of the first photon of each segment.
 
     Subsets may have kept the rows of the full file: then photons follow one another, as many as the counts.
 
+    **Arguments:** `size`: number of photons of the beam.
+
     **Raises:** ValueError for counts that are no whole numbers, and where neither rows nor counts fit.
     """
     location = file.location(f"{beam}/geolocation/ph_index_beg")
-    size = file.dataset(f"{beam}/heights/h_ph", _PHOTONS).shape[0]
     if not np.all((count >= 0) & (count == np.floor(count))):
         raise ValueError(
             f"{file.location(f'{beam}/geolocation/segment_ph_cnt')}: counts are no whole numbers"
@@ -316,10 +344,11 @@ def _first_photons(file: ProductFile, beam: str, count: np.ndarray) -> np.ndarra
     filled = count > 0
     if file.has(f"{beam}/geolocation/ph_index_beg"):
         # The product counts from 1; segments without photons have 0.
-        start = file.numbers(f"{beam}/geolocation/ph_index_beg", _PHOTONS) - 1
+        start = _rows_of(file, f"{beam}/geolocation/ph_index_beg", count.size, "segment_ph_cnt") - 1
         follows = np.all(start[filled][1:] == (start + count)[filled][:-1])
         if follows and np.all((start >= 0)[filled] & (start + count <= size)[filled]):
-            return np.where(filled, start, by_count)
+            # Segments without photons lie between the photons of their neighbours.
+            return by_count + (start - by_count)[filled].min(initial=size)
     if count.sum() != size:
         raise ValueError(
             f"{location}: neither do the indices fit the {size} photons stored, nor do the counts "
@@ -328,15 +357,19 @@ def _first_photons(file: ProductFile, beam: str, count: np.ndarray) -> np.ndarra
     return by_count
 
 
-def _pulses(file: ProductFile, beam: str, rows: slice, time: np.ndarray) -> np.ndarray:
-    """Return numbers of the laser pulses of photons, by the product's frames, or by time in a subset."""
-    names = [f"{beam}/heights/{name}" for name in ("pce_mframe_cnt", "ph_id_pulse")]
-    if all(map(file.has, names)):
-        frame, number = (file.numbers(name, _PHOTONS, 1, rows) for name in names)
+def _pulses(frame: np.ndarray, number: np.ndarray) -> np.ndarray:
+    """Return numbers of the laser pulses of photons, by the product's frames."""
+    # What overflows is no whole number.
+    with np.errstate(over="ignore", invalid="ignore"):
         return _whole_numbers(_PULSES_PER_FRAME * frame + number)
+
+
+def _pulses_by_time(time: np.ndarray) -> np.ndarray:
+    """Return numbers of the laser pulses of photons in a subset without the product's frames."""
     finite_time = time[np.isfinite(time)]
     first = float(finite_time.min()) if finite_time.size else 0.0
-    return _whole_numbers(np.rint((time - first) * PULSE_RATE))
+    with np.errstate(over="ignore", invalid="ignore"):
+        return _whole_numbers(np.rint((time - first) * PULSE_RATE))
 
 
 def _background_rate(file: ProductFile, beam: str, time: np.ndarray) -> np.ndarray:
@@ -344,7 +377,8 @@ def _background_rate(file: ProductFile, beam: str, time: np.ndarray) -> np.ndarr
     names = [f"{beam}/bckgrd_atlas/{name}" for name in ("delta_time", "bckgrd_rate")]
     if not all(map(file.has, names)):
         return np.full(time.shape, np.nan)
-    when, rate = (_without_fills(file.numbers(name, _PHOTONS)) for name in names)
+    when = _without_fills(file.numbers(names[0], _PHOTONS))
+    rate = _without_fills(_rows_of(file, names[1], when.size, "delta_time"))
     is_known = np.isfinite(when) & np.isfinite(rate)
     if not np.any(is_known):
         return np.full(time.shape, np.nan)
@@ -359,17 +393,20 @@ def _impulse(file: ProductFile, beam: str) -> PhotonImpulse | None:
     """
     spots = {1: "pce1_spot1", 3: "pce2_spot3"}
     table = "ancillary_data/tep/tep_valid_spot"
-    with_attributes = file.file[beam].attrs
-    if not file.has(table) or "atlas_spot_number" not in with_attributes:
+    spot = file.attribute(beam, "atlas_spot_number") if file.has(table) else None
+    if spot is None:
         return None
-    text = text_of_attribute(with_attributes["atlas_spot_number"])
+    text = text_of_attribute(spot)
     serving = _whole_numbers(file.numbers(table, _PHOTONS))
-    if not text.isdigit() or not 1 <= int(text) <= serving.size:
+    if not text.isdecimal() or not 1 <= int(text) <= serving.size:
         return None
     group = f"atlas_impulse_response/{spots.get(int(serving[int(text) - 1]))}/tep_histogram"
     if not (file.has(f"{group}/tep_hist") and file.has(f"{group}/tep_hist_time")):
         return None
-    time, count = (file.numbers(f"{group}/{name}", _PHOTONS) for name in ("tep_hist_time", "tep_hist"))
+    # Without numbers that are missing, or so large that sums of them overflow.
+    time, count = (
+        _without_fills(file.numbers(f"{group}/{name}", _PHOTONS)) for name in ("tep_hist_time", "tep_hist")
+    )
     return _impulse_of_histogram(1e9 * time, count)
 
 

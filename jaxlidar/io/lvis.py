@@ -7,6 +7,7 @@ version 2 `LON1023`.
 """
 
 import functools
+import math
 import os
 import re
 from pathlib import Path
@@ -304,7 +305,8 @@ def read_lvis_l2(path: str | os.PathLike[str]) -> ShotTable:
     `zenith`, `time`; and `rh` (shots, percentiles). Lengths are m, longitudes lie in [-180, 180).
 
     **Raises:** FileNotFoundError where there is no such file. ValueError, naming file and line, for a file
-    that is not text, that lacks the names of columns or the ground's, and for rows that are not numbers.
+    that is not text, that lacks the names of columns or the ground's, and for rows that are not numbers, or
+    infinite ones.
 
     **Source:** LVIS level 2 user guide (NSIDC data set LVISF2).
 
@@ -333,7 +335,12 @@ def read_lvis_l2(path: str | os.PathLike[str]) -> ShotTable:
     for number, line in enumerate(lines, 1):
         if line.strip() and not line.lstrip().startswith("#"):
             cells = split_cells(path, number, line, " ", len(names))
-            rows.append([parse_number(path, number, name, cell) for name, cell in zip(names, cells)])
+            row = [parse_number(path, number, name, cell) for name, cell in zip(names, cells)]
+            # NaN is a missing number; an infinite one is damage.
+            for name, value in zip(names, row):
+                if math.isinf(value):
+                    raise ValueError(f"{path}: line {number}: {name} is not finite")
+            rows.append(row)
     values = np.array(rows, float).reshape(len(rows), len(names))
     columns: dict[str, Column] = {}
     levels = {name: int(match[1]) for name in names if (match := _RELATIVE_HEIGHT.fullmatch(name))}
@@ -343,7 +350,9 @@ def read_lvis_l2(path: str | os.PathLike[str]) -> ShotTable:
         title, unit, description = _LEVEL_2.get(name, (name.lower(), "", ""))
         if unit == "degrees" and title.startswith("longitude"):
             column = np.remainder(column + 180.0, 360.0) - 180.0
-        is_whole = title in ("shot_number", "lfid") and bool(np.all(column == np.floor(column)))
+        is_whole = title in ("shot_number", "lfid") and bool(
+            np.all((column == np.floor(column)) & (np.abs(column) <= MAX_EXACT_INTEGER))
+        )
         columns[title] = Column(column.astype(np.int64) if is_whole else column, unit, description)
     if levels:
         ordered = sorted(levels, key=lambda name: levels[name])

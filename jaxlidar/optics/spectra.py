@@ -233,6 +233,8 @@ def read_spectrum_csv(path: str | os.PathLike[str], name: str | None = None) -> 
 
     **Returns:** a `Spectrum`.
 
+    **Warns:** `UnitWarning` for a wavelength that is beyond the infrared, which is read.
+
     **Raises:** FileNotFoundError where there is no such file. ValueError, naming the file and the line, for a
     line that is not two numbers, for a reflectance outside [0, 1] (per cent?), for a wavelength below 100 nm
     (micrometres?) or not above the one before, for fewer than two samples, and for a file that is not UTF-8

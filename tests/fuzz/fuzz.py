@@ -102,11 +102,15 @@ def read_and_judge(kind: FileKind, read: Callable[[Path], Any], path: Path) -> t
 
     Verdicts: "read" (the result is plausible), "refused" (a `ValueError` names the file and the place), "no
     place" (a `ValueError` does not), "nonsense" (the result is not plausible), "memory" (too much was
-    allocated), "escaped" (an error of another class). A warning is an error here.
+    allocated), "escaped" (an error of another class). A warning is an error here, but for a `UnitWarning`:
+    that is what the package says of a value that it reads, which may be anything.
     """
+    from jaxlidar import UnitWarning
+
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error")
+            warnings.simplefilter("ignore", UnitWarning)
             # NumPy warns of headers that NumPy for Python 2 wrote; such files are valid.
             warnings.filterwarnings("ignore", "Reading `.npy`")
             result = read(path)

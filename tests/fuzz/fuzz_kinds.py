@@ -119,11 +119,11 @@ def small_level_2(kind: str) -> bytes:
         return write_level_2(Path(folder) / "small.h5", kind).read_bytes()
 
 
-def small_icesat2(writer: str) -> bytes:
+def small_icesat2(writer: str, **options: bool) -> bytes:
     from tests.io import test_icesat2
 
     with tempfile.TemporaryDirectory() as folder:
-        return getattr(test_icesat2, writer)(Path(folder) / "small.h5").read_bytes()
+        return getattr(test_icesat2, writer)(Path(folder) / "small.h5", **options).read_bytes()
 
 
 def small_lvis() -> bytes:
@@ -386,11 +386,16 @@ KINDS = {
         for name, reader, make, is_plausible in (
             ("gedi 2a", "read_gedi_l2a", lambda: small_level_2("2A"), plausible_table),
             ("gedi 2b", "read_gedi_l2b", lambda: small_level_2("2B"), plausible_table),
-            ("atl03", "read_atl03", lambda: small_icesat2("write_photons"), plausible_track),
             ("atl08", "read_atl08", lambda: small_icesat2("write_heights"), plausible_table),
             ("lvis", "read_lvis_shots", small_lvis, plausible_shots),
         )
     },
+    "atl03": FileKind(
+        *("binary", "read_atl03", ".h5"),
+        tuple(lambda has=has: small_icesat2("write_photons", impulse=has) for has in (False, True)),
+        change_hdf5,
+        plausible_track,
+    ),
     "lvis text": text_kind(
         "read_lvis_l2", ".txt", small_lvis_text, plausible_table, place=rf"{LINE}|: no line begins"
     ),

@@ -1,5 +1,7 @@
 """Readers of GEDI level 2A and 2B: small files that are written here, rows by shot number, damaged files."""
 
+import tracemalloc
+
 import numpy as np
 import pytest
 
@@ -69,3 +71,47 @@ def test_beams_that_cannot_be_read_are_skipped_and_other_files_refused(tmp_path)
     (tmp_path / "text.h5").write_text("text")
     with pytest.raises(ValueError, match="not a readable HDF5 file"):
         read_gedi_l2a(tmp_path / "text.h5")
+
+
+@pytest.mark.parametrize("thickness", [[], [np.inf], [1e308], [np.nan], [0.0], [-9999.0]])
+def test_a_beam_whose_layers_have_no_thickness_is_skipped(tmp_path, thickness):
+    path = write_level_2(tmp_path / "b.h5", "2B")
+    with h5py.File(path, "r+") as file:
+        del file["BEAM0101/ancillary/dz"]
+        file["BEAM0101/ancillary/dz"] = np.array(thickness, float)
+    with pytest.warns(FileWarning, match=r"b\.h5: /BEAM0101/ancillary/dz: .* is no thickness of layers"):
+        assert read_gedi_l2b(path)["shot_number"].tolist() == [1, 2, 3]
+
+
+def test_of_many_thicknesses_of_layers_one_is_read(tmp_path):
+    path = write_level_2(tmp_path / "b.h5", "2B")
+    with h5py.File(path, "r+") as file:
+        for beam in ("BEAM0000", "BEAM0101"):
+            del file[f"{beam}/ancillary/dz"]
+            # As many as are plausible in a file, which in double precision are 8 times as many bytes.
+            file.create_dataset(f"{beam}/ancillary/dz", data=np.full(2**24, 5, np.int8), compression=1)
+    tracemalloc.start()
+    table = read_gedi_l2b(path)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert table.columns["pavd_z"].axis.values[:3].tolist() == [0.0, 5.0, 10.0]
+    assert peak < 2**24
+
+
+@pytest.mark.parametrize("at", [0, 24])
+def test_texts_in_a_damaged_heap_are_refused(tmp_path, at):
+    path = write_level_2(tmp_path / "a.h5", "2A")
+    content = bytearray(path.read_bytes())
+    # Of the first text, or of what is free behind two: HDF5 stays at an object of number 0 and size 0.
+    heap = content.index(b"GCOL") + 16 + at
+    content[heap : heap + 48] = bytes(48)
+    path.write_bytes(content)
+    with pytest.raises(ValueError, match=r"a\.h5: /BEAM0000/geolocation/rh_a2: damaged \(the heap at byte"):
+        read_gedi_l2a(path)
+
+
+def test_texts_are_read_through_links_to_other_files(tmp_path):
+    write_level_2(tmp_path / "a.h5", "2A")
+    with h5py.File(tmp_path / "links.h5", "w") as file:
+        file["BEAM0000"] = h5py.ExternalLink("a.h5", "/BEAM0000")
+    assert np.all(read_gedi_l2a(tmp_path / "links.h5")["rh_a2"] == 2.5)

@@ -1,5 +1,7 @@
 """Readers of ICESat-2's ATL03 and ATL08: small files that are written here, and a recorded track."""
 
+import warnings
+
 import numpy as np
 import pytest
 
@@ -138,6 +140,52 @@ def test_other_files_and_beams_are_refused(tmp_path):
         read_atl03(path, "gt1l")
     with pytest.warns(FileWarning, match="1 of 9 photons have no height"):
         assert len(read_atl03(path, "gt2r")) == 8
+
+
+@pytest.mark.parametrize(
+    ("name", "change", "message"),
+    [
+        ("geolocation/solar_elevation", lambda x: x[:3], r"\(3,\); .* \(4,\): segment_ph_cnt has 4 rows"),
+        ("geolocation/ph_index_beg", lambda x: x[:0], r"\(0,\); .* \(4,\): segment_ph_cnt has 4 rows"),
+        ("heights/pce_mframe_cnt", lambda x: x[:8], r"\(8,\); .* \(9,\): h_ph has 9 rows"),
+        ("heights/lat_ph", lambda x: np.repeat(x, 2), r"\(18,\); .* \(9,\): h_ph has 9 rows"),
+        ("heights/signal_conf_ph", lambda x: x[:, :0], r"\(9, 0\); .* \(9, 5\): h_ph has 9 rows"),
+        ("bckgrd_atlas/bckgrd_rate", lambda x: x[:1], r"\(1,\); .* \(2,\): delta_time has 2 rows"),
+    ],
+)
+def test_datasets_of_another_number_of_rows_are_refused(tmp_path, name, change, message):
+    path = write_photons(tmp_path / "atl03.h5")
+    with h5py.File(path, "r+") as file:
+        values = file[f"gt1r/{name}"][...]
+        del file[f"gt1r/{name}"]
+        file[f"gt1r/{name}"] = change(values)
+    with pytest.raises(ValueError, match=rf"atl03\.h5: /gt1r/{name}: shape {message}"):
+        read_atl03(path)
+
+
+def test_numbers_that_overflow_are_missing(tmp_path):
+    path = write_photons(tmp_path / "atl03.h5", impulse=True)
+    with h5py.File(path, "r+") as file:
+        for name in (
+            "gt1r/heights/pce_mframe_cnt",
+            "atlas_impulse_response/pce2_spot3/tep_histogram/tep_hist",
+        ):
+            values = file[name][...].astype(float)
+            del file[name]
+            file[name] = np.full_like(values, 1e308)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        track = read_atl03(path)
+    assert track.impulse is None
+    assert len(set(track.pulse.tolist())) == 1
+
+
+def test_photons_before_those_of_an_empty_first_segment_are_left_out(tmp_path):
+    path = write_photons(tmp_path / "atl03.h5")
+    with h5py.File(path, "r+") as file:
+        # The three photons of the first segment belong to none.
+        file["gt1r/geolocation/segment_ph_cnt"][0] = 0
+    assert read_atl03(path).height.tolist() == list(range(2003, 2009))
 
 
 def test_a_recorded_track_has_the_segments_of_its_ground(shared):

@@ -109,6 +109,12 @@ def test_level_2_text_is_a_table(tmp_path):
     assert (table["ground"][1], table["canopy_top"][1], table["zenith"][1]) == (300.25, 320.0, 2.0)
     np.testing.assert_array_equal(table["rh"][0], [4.5, 18.5, 19.75])
     assert table.columns["rh"].axis.values.tolist() == [50.0, 98.0, 100.0]
+    # More digits than a whole number has in double precision are no number of a shot.
+    path.write_text("\n".join([names, row.format("1e39")]))
+    assert read_lvis_l2(path)["shot_number"].tolist() == [1e39]
+    path.write_text("\n".join([names, row.format("nan").replace("285.5", "-inf")]))
+    with pytest.raises(ValueError, match=r"LVISF2\.TXT: line 2: GLON is not finite"):
+        read_lvis_l2(path)
     path.write_text("\n".join([names, "57 7 60000.5"]))
     with pytest.raises(ValueError, match="line 2: 3 values; the header names 17"):
         read_lvis_l2(path)
