@@ -407,7 +407,9 @@ def _impulse(file: ProductFile, beam: str) -> PhotonImpulse | None:
     time, count = (
         _without_fills(file.numbers(f"{group}/{name}", _PHOTONS)) for name in ("tep_hist_time", "tep_hist")
     )
-    return _impulse_of_histogram(1e9 * time, count)
+    # Damaged bytes may be NaN that signal, of which products warn.
+    with np.errstate(invalid="ignore"):
+        return _impulse_of_histogram(1e9 * time, count)
 
 
 def _impulse_of_histogram(time: np.ndarray, count: np.ndarray) -> PhotonImpulse | None:

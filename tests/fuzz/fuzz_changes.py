@@ -214,8 +214,8 @@ def _change_dataset(random: Random, group: Any) -> str:
     names: list[str] = []
     group.visititems(lambda name, node: names.append(name) if hasattr(node, "shape") else None)
     name = choose(random, sorted(names))
-    if group[name].nbytes > 2**27:
-        # An earlier change made it sparse: it is not to fill the memory here.
+    if group[name].size > 2**20:
+        # An earlier change made it sparse. Changed, it would be stored, and fill the memory for its size.
         raise ValueError(f"{group.name}/{name} is too large to be changed")
     array, empty = group[name][...], h5py.Empty("f8")
     kind = choose(random, ["value"] * 3 + ["all", "type", "shape", "sparse", "chunk", "link", "gone"])

@@ -91,7 +91,7 @@ def small_cloud(compress: bool, point_format: int = 6, points: int = 60) -> byte
 
     version = "1.4" if point_format >= 6 else "1.3" if point_format >= 4 else "1.2"
     las = laspy.LasData(laspy.LasHeader(point_format=point_format, version=version))
-    las.header.scales = [0.001] * 3
+    las.header.scales = np.full(3, 0.001)
     las.add_extra_dim(laspy.ExtraBytesParams("height", "f4", "above the ground"))
     las.header.vlrs.append(laspy.VLR("me", 7, "a record", bytes(40)))
     index = np.arange(points)

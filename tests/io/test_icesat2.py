@@ -180,6 +180,18 @@ def test_numbers_that_overflow_are_missing(tmp_path):
     assert len(set(track.pulse.tolist())) == 1
 
 
+def test_a_signalling_nan_of_the_impulse_is_missing(tmp_path):
+    path = write_photons(tmp_path / "atl03.h5", impulse=True)
+    with h5py.File(path, "r+") as file:
+        time = file["atlas_impulse_response/pce2_spot3/tep_histogram/tep_hist_time"]
+        values = time[...]
+        values.view(np.uint64)[7] = 0x7FF0000000000001
+        time[...] = values
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert read_atl03(path).impulse is None
+
+
 def test_photons_before_those_of_an_empty_first_segment_are_left_out(tmp_path):
     path = write_photons(tmp_path / "atl03.h5")
     with h5py.File(path, "r+") as file:
