@@ -21,13 +21,13 @@ heights are the fitted waveform's, read by the product's rules (`inversion.gedi_
 
 **The closed forms of `inversion.gedi_table` are the first choice.** Of 60 shots of a savanna, 44 are rated
 good and none bad. The ground is low, by 0.09 m from the product's in the median and by 0.32 m or more in a
-tenth of the good shots; the matched mode is within 0.02 m in the median and 0.08 m in all. The likely
-cause is relief: it gives the ground's echo shoulders, which a plane under plants explains by low plants, with
-the ground below them. Waveforms alone do not tell the two apart. Two standard
-errors of the ground cover the product's in all good shots, but only as they include the difference from the
-matched mode; those of the fit alone cover 84 %. Rank correlations with the product are 0.98 for RH98, 0.91
-for `pai` (0.90 above 0.1, in the median 0.86 of the product's), 0.39 for `pai_layers`, and 0.75 for the
-canopy's fitted top, which the layers' prior blurs.
+tenth of the good shots; the matched mode is within 0.02 m in the median and 0.08 m in all. The likely cause
+is relief: it gives the ground's echo shoulders, which a plane under plants explains by low plants, with the
+ground below them. Waveforms alone do not tell the two apart. Two standard errors of the ground cover the
+product's in all good shots, but only as they include the difference from the matched mode; those of the fit
+alone cover 84 %. Rank correlations with the product are 0.98 for RH98, 0.91 for `pai` (0.90 above 0.1, in the
+median 0.86 of the product's), 0.39 for `pai_layers`, and 0.75 for the canopy's fitted top, which the layers'
+prior blurs.
 """
 
 import argparse

@@ -62,7 +62,9 @@ def main(argv=None):
             ax.errorbar(chemistry, differences, 2 * error, fmt="o", ms=2, lw=0.5, color=COLOURS[0])
             ax.axhline(0.0, color="0.6", lw=0.8)
             within = np.mean(np.abs(differences) < 2 * error)
-            ax.set_title(f"{name}:\n{trait}, {100 * within:.0f} % within 2 s.e.", fontsize=8)
+            relative = np.median(differences / chemistry)
+            title = f"{name}:\n{trait}, {within:.0%} within 2 s.e., median {relative:+.0%}"
+            ax.set_title(title, fontsize=8)
             ax.locator_params(axis="x", nbins=4)
             ax.set(xlabel=f"measured ({CHEMISTRY[trait][1]})")
         for row in axes:

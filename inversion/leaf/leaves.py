@@ -48,9 +48,9 @@ _RECOMMENDED_DOMAINS = {
 _NEEDLE_DOMAIN = ((1500.0, 1800.0), (2050.0, 2400.0))
 _NEEDLE_TRAITS = ("Cw", "Cm")
 # Relative errors of chemistry that no spectrum shows, with the recommended domains: Cab and Car come out 7 %
-# and 8 % too low on ANGERS, and 16 % and 19 % too high on LOPEX, in the median; these are the root mean
-# squares. Coefficients of PROSPECT and the extraction of pigments, which differs between laboratories, have a
-# part in them.
+# and 8 % too low on ANGERS, and 16 % and 19 % too high on LOPEX, in the median; these are about the root
+# mean squares. Coefficients of PROSPECT and the extraction of pigments, which differs between laboratories,
+# have a part in them.
 _CALIBRATION = {"Cab": 0.12, "Car": 0.14}
 # Transmittance of gaps above which a leaf is taken for needles.
 _GAP_LIGHT = 0.015
@@ -179,7 +179,7 @@ def invert_leaves(
     Standard errors include PROSPECT's own error, correlated over wavelengths; its size and length follow from
     the residuals of each leaf. They miss errors that residuals do not show, such as an absorption coefficient
     that is wrong by the same factor everywhere. With the recommended domains, 12 % of Cab and 14 % of Car
-    stand for these: so much the medians of two databases are off.
+    stand for these: the root mean squares of the median errors on two databases.
 
     Root mean squared errors on the measured leaves of three databases, and the fraction of values within two
     standard errors:

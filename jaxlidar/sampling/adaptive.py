@@ -120,7 +120,7 @@ class StoppingRule:
 
     rtol: Any
     atol: float = 0.0
-    min_size: Any = 1
+    min_size: int = 1
     max_size: int | None = None
 
     def exceeds(self, errors: HasErrors) -> Any:

@@ -375,12 +375,13 @@ def _trace_narrow_shots(
         following = jnp.minimum(_LATTICE_STEPS.next_size(n_parts, results.error, rtol), max_parts)
         pending = is_pending(*state)
         n_parts = jnp.where(pending, jnp.where(n_parts == 0, first_parts, following), n_parts)
-        first, n_pending = jnp.argsort(~pending, stable=True), jnp.sum(pending, dtype=jnp.int32)
+        # Numbers of the shots, those that are pending first.
+        order, n_pending = jnp.argsort(~pending, stable=True), jnp.sum(pending, dtype=jnp.int32)
 
         def trace_group(group: Array, results: ShotResults) -> ShotResults:
             position = group * _SHOTS_AT_ONCE + jnp.arange(_SHOTS_AT_ONCE, dtype=jnp.int32)
             exists = position < n_pending
-            numbers = first[jnp.minimum(position, n_shots - 1)]
+            numbers = order[jnp.minimum(position, n_shots - 1)]
             new = trace_some(numbers, jnp.where(exists, n_parts[numbers], 0))
             # Shots that fill up the last group are dropped: their number is that of no shot.
             numbers = jnp.where(exists, numbers, n_shots)
@@ -415,11 +416,10 @@ def _trace_together(
         keys = jax.vmap(jax.random.fold_in, (None, 0))(_aim_shot(scene, setup, shot, key).key, lattices)
         return jax.vmap(lambda k: footprint_shift(scene, k))(keys)
 
-    shifts, beams = (
-        jax.vmap(shifts_of)(shots),
-        jax.vmap(lambda s: make_beam(setup_of_shot(setup, s).lidar))(shots),
-    )
-    # Coordinates are relative to the aim point of the first shot: others of its chunk are near it.
+    shifts = jax.vmap(shifts_of)(shots)
+    beams = jax.vmap(lambda shot: make_beam(setup_of_shot(setup, shot).lidar))(shots)
+    # Coordinates are relative to the aim point of the first shot. Shots that follow one another are near it;
+    # at a distance, single precision places rays to 1e-7 of that.
     offsets = jax.vmap(lambda shot: aim_offset(setup, shot))(shots)
     scene_of_first = aim_at(scene, setup.lidar, offsets[0])
     aims = jnp.pad(offsets - offsets[:1], ((0, 0), (0, 3 - offsets.shape[1])))

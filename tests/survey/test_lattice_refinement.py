@@ -99,10 +99,18 @@ def strategy_of(survey: jl.Survey, scene: jl.Scene):
     return choose_strategy(survey, scene, rtol=0.2, max_orders=1, window=None, shared=None)
 
 
+def shots_of_a_tripod() -> jl.Survey:
+    """Return shots of 0.3 m at 20 m, from three places beside the crown."""
+    lidar = jl.Lidar(sensor=(0.0, 0.0, 1.5), divergence=15.0, pulse=jl.GaussianPulse(fwhm=4.0))
+    sensors = np.array([(-6.0, 6.0, 1.5), (-6.0, 9.0, 2.0), (-5.5, 12.0, 1.5)])
+    return jl.Survey(lidar, sensor=sensors, zenith=[95.0, 100.0, 80.0], azimuth=90.0)
+
+
+@pytest.mark.parametrize("shots_of", [lambda: narrow_shots(3), shots_of_a_tripod], ids=["above", "tripod"])
 @BY_PRECISION
-def test_parts_of_many_shots_are_those_of_single_ones(precision):
+def test_parts_of_many_shots_are_those_of_single_ones(precision, shots_of):
     """Lattices that are traced together return what each returns alone; planted: that of another shot."""
-    strategy = strategy_of(narrow_shots(3), terrain_under(edge()))
+    strategy = strategy_of(shots_of(), terrain_under(edge()))
     setup, shots = strategy.setup, shot_geometry(strategy.survey, 0, 3).as_arrays()
     n_rays, shifts = 8, jnp.asarray([[0.3, 0.8], [0.6, 0.1], [0.9, 0.5]])
     slices = RaySlice(jnp.asarray([0, 1, 2]), jnp.asarray([1, 3, 4]))
@@ -112,7 +120,7 @@ def test_parts_of_many_shots_are_those_of_single_ones(precision):
         scene = build_device_scene(setup, derivatives="none")
         offsets = jax.vmap(lambda shot: aim_offset(setup, shot))(shots)
         beams = jax.vmap(lambda shot: make_beam(setup_of_shot(setup, shot).lidar))(shots)
-        aims = jnp.pad(offsets - offsets[:1], ((0, 0), (0, 1)))
+        aims = jnp.pad(offsets - offsets[:1], ((0, 0), (0, 3 - offsets.shape[1])))
         together = trace_parts(aim_at(scene, setup.lidar, offsets[0]), beams, aims, shifts, slices, n_rays)
 
         def trace_alone(lattice):
