@@ -62,8 +62,8 @@ def main(argv=None):
             ax.errorbar(chemistry, differences, 2 * error, fmt="o", ms=2, lw=0.5, color=COLOURS[0])
             ax.axhline(0.0, color="0.6", lw=0.8)
             within = np.mean(np.abs(differences) < 2 * error)
-            relative = np.median(differences / chemistry)
-            title = f"{name}:\n{trait}, {within:.0%} within 2 s.e., median {relative:+.0%}"
+            median = 100 * np.median(differences / chemistry)
+            title = f"{name}:\n{trait}, {100 * within:.0f} % within 2 s.e., median {median:+.1f} %"
             ax.set_title(title, fontsize=8)
             ax.locator_params(axis="x", nbins=4)
             ax.set(xlabel=f"measured ({CHEMISTRY[trait][1]})")
@@ -76,8 +76,9 @@ def main(argv=None):
         rows,
         title="Measured leaves",
         caption="""Fitted less measured chemistry, leaf by leaf, with bars of two standard errors as the
-        fit states them: they should reach zero for 95 % of the leaves. Errors of Cab and Car contain 12
-        and 14 % for what spectra do not tell. Cw and Cm of needles come from a domain of their own.""",
+        fit states them: they should reach zero for 95 % of the leaves. Medians are relative. Errors of
+        Cab and Car contain 12 and 14 % for what spectra do not tell. Cw and Cm of needles come from a
+        domain of their own.""",
         unchecked="""Chemistry has errors of its own, which are not known and not in the bars. Coefficients of
         PROSPECT-D were calibrated with such leaves, some of these among them.""",
         draw=draw,

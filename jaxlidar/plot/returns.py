@@ -4,12 +4,14 @@ Returns are coloured by their class, their material or their height. Each group 
 the most frequent first, so that rare ones lie on top.
 """
 
+import itertools
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 from matplotlib.axes import Axes
-from mpl_toolkits.mplot3d import Axes3D
+from matplotlib.ticker import MaxNLocator
+from mpl_toolkits.mplot3d import Axes3D, proj3d
 
 from jaxlidar._checks import check_choice, check_kind, check_number, check_range, check_shape
 from jaxlidar.instrument.lidar import Lidar
@@ -304,13 +306,20 @@ def _oblique_axes(
     middle = 0.5 * (low + high)
     for name, centre, side in zip(("xlim", "ylim", "zlim"), middle, sides):
         ax.set(**{name: (centre - 0.5 * side, centre + 0.5 * side)})
-    # The corners of a wide box, and their labels, would extend beyond the edges of the axes.
-    zoom: Any = 0.58
-    ax.set_box_aspect(sides.tolist(), zoom=zoom)
     # matplotlib's azimuth is counted from the x axis, counterclockwise.
     ax.view_init(elev=elevation, azim=90.0 - azimuth)
+    # A box of any shape fills the axes but for the room of its labels.
+    ax.set_box_aspect(sides.tolist(), zoom=1)
+    corners = np.array(list(itertools.product(*zip(middle - 0.5 * sides, middle + 0.5 * sides))))
+    x, y, z = corners.T
+    horizontal, vertical, _ = proj3d.proj_transform(x, y, z, ax.get_proj())
+    # In parts of the axes' half width, from their centre: nearer corners lie farther out.
+    extent = np.max(np.abs(np.stack([horizontal, vertical]))) / ax.viewLim.xmax
+    zoom: Any = 0.72 / extent
+    ax.set_box_aspect(sides.tolist(), zoom=zoom)
     ax.set(xlabel="x, east (m)", ylabel="y, north (m)", zlabel="height (m)")
     ax.tick_params(labelsize="x-small")
-    ax.locator_params(nbins=4)
+    for axis, side in zip((ax.xaxis, ax.yaxis, ax.zaxis), sides):
+        axis.set_major_locator(MaxNLocator(nbins=max(round(4 * side / max(sides)), 1)))
     ax.ticklabel_format(style="plain", useOffset=False)
     return ax
