@@ -29,7 +29,7 @@ CHOSEN = {
     "ground_under_trees": 2,
     "peak_detectors": 0,
     "hectare": 1,
-    "strip": 2,
+    "strip": 3,
     "recorded_shots": 0,
     "gedi_file": 0,
     "photon_track": 1,
