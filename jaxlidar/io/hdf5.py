@@ -6,7 +6,7 @@ read only if it has numbers, its chunks are all stored, and its size is plausibl
 **Texts.** Attributes that are texts of variable length lie in global heaps. HDF5 goes through a heap from
 object to object, by the sizes that they state. At a step of no length, as over zeros, it stays for ever, in
 compiled code that no signal interrupts (found with HDF5 2.0). So such attributes are read through a stream
-that refuses heaps like that. Only they are: a stream of Python is slower than HDF5's own.
+that refuses heaps like that. Of products only they are: a stream of Python is slower than HDF5's own.
 """
 
 import contextlib
@@ -72,7 +72,7 @@ class ProductFile:
         import h5py
 
         _, size_of_lengths = self.file.id.get_create_plist().get_sizes()
-        stream = self._stack.enter_context(_CheckedHeapStream(self.path, size_of_lengths))
+        stream = self._stack.enter_context(CheckedHeapStream(self.path, size_of_lengths))
         return self._stack.enter_context(h5py.File(stream, "r"))
 
     def location(self, name: str) -> str:
@@ -182,7 +182,7 @@ class ProductFile:
         return values if unit is None or units_agree(unit, size) else values * (unit / size)
 
 
-class _CheckedHeapStream(io.FileIO):
+class CheckedHeapStream(io.FileIO):
     """A file from which HDF5 reads no global heap in which it would stay for ever.
 
     **Raises:** OSError where one is read.

@@ -21,6 +21,7 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from jaxlidar.io.checks import refuse_damage
+from jaxlidar.io.hdf5 import CheckedHeapStream
 from jaxlidar.io.rows import BLOCK, CHECKSUM, RowVariables, checksum_of
 
 # The attribute of the root with the number of the format.
@@ -29,6 +30,8 @@ _ZARR_SUFFIX = ".zarr"
 # The file that makes a folder a Zarr store of version 3.
 _ZARR_ROOT = "zarr.json"
 _HDF5_SIGNATURE = b"\x89HDF\r\n\x1a\n"
+# First bytes of an HDF5 file: the signature, the version, and what follows up to the size of lengths.
+_SUPERBLOCK = 16
 # Warning filters are one list for all threads: of two that change it, one would restore the other's.
 _FILTER_LOCK = threading.Lock()
 # Values as they are stored, and read when they are asked for: an index would read its coordinate at once.
@@ -87,10 +90,15 @@ class NetcdfFile:
         # HDF5 keeps files that it opened by name, also damaged ones, and would give them again for a new file
         # of that name. It does not keep those that Python opens.
         with contextlib.ExitStack() as stack:
-            stream = stack.enter_context(path.open("rb"))
-            if stream.read(len(_HDF5_SIGNATURE)) != _HDF5_SIGNATURE:
+            with path.open("rb") as beginning:
+                superblock = beginning.read(_SUPERBLOCK)
+            if not superblock.startswith(_HDF5_SIGNATURE):
                 raise ValueError(f"{path}: byte 0: no netCDF-4 file")
-            stream.seek(0)
+            # Names and texts lie in heaps (`jaxlidar.io.hdf5`). Before version 2, two bytes stand before the
+            # sizes of offsets and lengths that are no part of the later ones.
+            is_old = superblock[8:9] < b"\2"
+            size_of_lengths = superblock[14 if is_old else 10] if len(superblock) == _SUPERBLOCK else 0
+            stream = stack.enter_context(CheckedHeapStream(path, size_of_lengths))
             with refuse_damage(f"{path}: damaged"):
                 file = stack.enter_context(h5netcdf.File(stream, "r", decode_vlen_strings=True))
             yield cls(path, file)

@@ -205,6 +205,19 @@ def test_damaged_files_are_refused_by_name(name, request, tmp_path):
             jl.open(path)
 
 
+@pytest.mark.parametrize("at", [0, 24])
+def test_a_damaged_heap_of_names_is_refused(wave, tmp_path, at):
+    """HDF5 would stay for ever at an object of number 0 and size 0: the first, or one behind it."""
+    path = tmp_path / "a.nc"
+    jl.io.save(wave, path)
+    content = bytearray(path.read_bytes())
+    start = content.index(b"GCOL") + 16 + at
+    content[start : start + 48] = bytes(48)
+    path.write_bytes(content)
+    with pytest.raises(ValueError, match=r"a\.nc: damaged \(the heap at byte"):
+        jl.open(path)
+
+
 def test_damaged_values_are_refused_with_the_name_of_their_variable(wave, tmp_path):
     path = tmp_path / "a.nc"
     wave.save(path)
