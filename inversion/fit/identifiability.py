@@ -46,6 +46,7 @@ from inversion.fit.unknowns import (
     flat_bounds,
     flat_labels,
     flat_start,
+    set_lidar_values,
     set_values,
     split_by_name,
     with_start,
@@ -158,7 +159,7 @@ def cramer_rao(
     check_key(key)
     lidar = with_fixed_window(lidar)
     sizes = trace_sizes(n_photons, n_rays, max_orders, plan)
-    bound_unknowns = bind_unknowns(unknowns, scene)
+    bound_unknowns = bind_unknowns(unknowns, scene, lidar)
     priors = fixed_priors(bound_unknowns)
     sample_times = None if time is None else as_sample_times(time, lidar)
     # Derivatives are needed at the scene only: without sample times, its own plan serves.
@@ -337,14 +338,17 @@ def profile_likelihood(
             # First of all values: the `apply` of other unknowns may depend on it.
             value = jnp.asarray(points[i], fixed.start.dtype).reshape(fixed.start.shape)
             scene_at_point = set_values(scene, (fixed.setter,), (value,))
+            lidar_at_point = set_lidar_values(problem.lidar, (fixed.setter,), (value,))
             # Bound again: they may depend on the scene.
-            bound_unknowns = bind_unknowns(free_unknowns, scene_at_point)
+            bound_unknowns = bind_unknowns(free_unknowns, scene_at_point, lidar_at_point)
             if neighbour is not None:
                 bound_unknowns = [
                     with_start(u, jnp.asarray(neighbour[u.name], u.start.dtype)) for u in bound_unknowns
                 ]
             bound_unknowns = [u._replace(smooth_level=v) for u, v in zip(bound_unknowns, levels)]
-            problem_at_point = dataclasses.replace(problem, scene=scene_at_point, unknowns=bound_unknowns)
+            problem_at_point = dataclasses.replace(
+                problem, lidar=lidar_at_point, scene=scene_at_point, unknowns=bound_unknowns
+            )
             # The same photons at all values: the noise of the simulation is no part of differences in
             # chi-squared.
             fits[i], _, recorder = fit_problem(problem_at_point, plan, key, throw=options["throw"])

@@ -40,7 +40,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from inversion.fit.planning import N_BATCHES
-from inversion.fit.unknowns import BoundUnknown, Dependence, Setter, set_values
+from inversion.fit.unknowns import BoundUnknown, Dependence, Setter, set_lidar_values, set_values
 from jaxlidar import (
     Lidar,
     Plan,
@@ -213,7 +213,8 @@ class SimulationInputs(eqx.Module):
 
     def setup(self, values: Values) -> Setup:
         """Return the setup with these values."""
-        return make_setup(self.lidar, set_values(self.scene, self.setters, values), self.plan)
+        lidar = set_lidar_values(self.lidar, self.setters, values)
+        return make_setup(lidar, set_values(self.scene, self.setters, values), self.plan)
 
     def as_function_of(
         self, dependence: Dependence, values: Values

@@ -1,9 +1,9 @@
-"""Plans for fits: one plan that is valid for all scenes within the bounds of the unknowns.
+"""Plans for fits: one plan that is valid for all scenes and lidars within the bounds of the unknowns.
 
-A compiled simulation has loops of fixed length and a fixed time axis. In a fit the scene moves, so that both
-have to be long enough for every scene within the bounds. The bounds' corners are examined, which suffices for
-quantities that are monotonic in each unknown, such as heights and sizes. Beyond four unknowns not all corners
-are examined (`corner_scenes`).
+A compiled simulation has loops of fixed length and a fixed time axis. In a fit the scene or the lidar moves,
+so that both have to be long enough for every case within the bounds. The bounds' corners are examined, which
+suffices for quantities that are monotonic in each unknown, such as heights and sizes. Beyond four unknowns
+not all corners are examined (`corner_cases`).
 """
 
 import itertools
@@ -13,13 +13,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from inversion.fit.unknowns import BoundUnknown, set_values
+from inversion.fit.unknowns import BoundUnknown, set_lidar_values, set_values
 from jaxlidar import Lidar, Plan, Scene, Survey
 from jaxlidar import plan as make_plan
 from jaxlidar.extend import check_integer, check_kind
 from jaxlidar.planning.effects import effects_of_family
 from jaxlidar.planning.plan import MIN_BATCHES
-from jaxlidar.planning.plan_check import check_reach
+from jaxlidar.planning.plan_check import check_pulse, check_reach
 from jaxlidar.planning.scene_family import union_plan
 
 # Up to this many unknowns that change the response, every corner of the bounds is examined: 2^4 of them.
@@ -60,13 +60,14 @@ def trace_sizes(
     return TraceSizes(photons // N_BATCHES, rays // N_BATCHES, max_orders)
 
 
-def corner_scenes(scene: Scene, unknowns: list[BoundUnknown]) -> list[Scene]:
-    """Return the scene at its start, and with the unknowns that change the response at their bounds.
+def corner_cases(lidar: Lidar, scene: Scene, unknowns: list[BoundUnknown]) -> list[tuple[Lidar, Scene]]:
+    """Return lidar and scene at their start, and with the unknowns that plans depend on at their bounds.
 
-    These are the geometric ones and those of extinction. All combinations for up to four unknowns; for more,
-    each alone and all together. An array is at its lower or its upper bounds as a whole.
+    These are the geometric ones, those of extinction, and all of the lidar, whose pulse decides the width of
+    time bins. All combinations for up to four unknowns; for more, each alone and all together. An array is at
+    its lower or its upper bounds as a whole.
     """
-    moving = [i for i, u in enumerate(unknowns) if u.setter.changes_response]
+    moving = [i for i, u in enumerate(unknowns) if u.setter.changes_response or u.setter.of_lidar]
     if len(moving) <= _MAX_UNKNOWNS_FOR_ALL_CORNERS:
         corners = (
             [dict(zip(moving, c)) for c in itertools.product(("low", "high"), repeat=len(moving))]
@@ -77,14 +78,14 @@ def corner_scenes(scene: Scene, unknowns: list[BoundUnknown]) -> list[Scene]:
         corners = [{i: side} for i in moving for side in ("low", "high")]
         corners += [dict.fromkeys(moving, side) for side in ("low", "high")]
     setters = tuple(u.setter for u in unknowns)
-    scenes = []
+    cases = []
     for side_of in [{}, *corners]:
-        values = [
+        values = tuple(
             jnp.asarray(getattr(u, side_of[i]), u.start.dtype) if i in side_of else u.start
             for i, u in enumerate(unknowns)
-        ]
-        scenes.append(set_values(scene, setters, tuple(values)))
-    return scenes
+        )
+        cases.append((set_lidar_values(lidar, setters, values), set_values(scene, setters, values)))
+    return cases
 
 
 def plan_for_bounds(
@@ -94,14 +95,15 @@ def plan_for_bounds(
     time: Float[np.ndarray, " samples"],
     sizes: TraceSizes,
 ) -> Plan:
-    """Plan the starting scene, with loops and fine time bins long enough for all `corner_scenes`.
+    """Plan the starting scene, with loops and fine time bins long enough for all `corner_cases`.
 
     Fine time bins are those in which light is collected; `time` has the samples of the record. With
     a `Survey` the plan serves all of its shots.
 
     Scatterer channels, orders and step lengths are those of the starting scene.
 
-    1. Plan the starting scene; all plans share its orders, bin width and step length.
+    1. Plan the starting scene; all plans share its orders, bin width and step length. Where the pulse is
+       unknown, the width is that of the shortest one.
     2. Plan every corner.
     3. Take the union of the fine time bins, and the largest of each loop's length.
 
@@ -111,7 +113,8 @@ def plan_for_bounds(
     interval = float(lidar.sampling_interval)
     # A thousandth of a sample keeps the last one in a window whose end is rounded.
     window = (float(time[0]), float(time[0]) + (time.size - 1 + 1e-3) * interval)
-    scenes = corner_scenes(scene, unknowns)
+    cases = corner_cases(lidar, scene, unknowns)
+    scenes = [case_scene for _, case_scene in cases]
     common: dict[str, Any] = {
         "window": window,
         "n_photons": sizes.photons_per_batch,
@@ -119,21 +122,26 @@ def plan_for_bounds(
         "describe": False,
         "effects": effects_of_family(scenes),
     }
-    first = make_plan(shots, scenes[0], max_orders=sizes.max_orders, **common)
-    # Fits of surveys trace all derivatives, and many shots at once.
-    if survey is None and not first.config.keeps_histories:
-        first = _plan_with_histories(first, lidar, scenes[0], max_orders=sizes.max_orders, **common)
-    histories = first.config.keeps_histories
-    common.update(max_orders=first.orders, bin_width=first.bins.width, histories=histories)
-    if scene.canopy is not None:
-        common.update(max_step=first.limits.max_segment)
-    plans = [first]
-    for corner in scenes[1:]:
+
+    def plan_corner(case: tuple[Lidar, Scene], **options: Any) -> Plan:
         try:
-            plans.append(make_plan(shots, corner, **common))
+            return make_plan(case[0] if survey is None else survey, case[1], **options)
         except ValueError as error:
             raise ValueError(f"at the bounds of the unknowns the scene is inadmissible: {error}") from error
-    return union_plan(lidar, scenes, plans, survey)
+
+    first = make_plan(shots, scene, max_orders=sizes.max_orders, **common)
+    # Fits of surveys trace all derivatives, and many shots at once.
+    if survey is None and not first.config.keeps_histories:
+        first = _plan_with_histories(first, lidar, scene, max_orders=sizes.max_orders, **common)
+    width = first.bins.width
+    if any(u.setter.of_lidar for u in unknowns):
+        width = min(width, *(plan_corner(case, **common).bins.width for case in cases[1:]))
+    common.update(max_orders=first.orders, bin_width=width, histories=first.config.keeps_histories)
+    if scene.canopy is not None:
+        common.update(max_step=first.limits.max_segment)
+    if width < first.bins.width:
+        first = plan_corner(cases[0], **common)
+    return union_plan(cases, [first, *(plan_corner(case, **common) for case in cases[1:])], survey)
 
 
 def _plan_with_histories(first: Plan, lidar: Lidar, scene: Scene, **options: Any) -> Plan:
@@ -158,7 +166,7 @@ def checked_plan(
     time: Float[np.ndarray, " samples"],
     sizes: TraceSizes,
 ) -> Plan:
-    """Check a plan for the samples and for all `corner_scenes`, or make one with `plan_for_bounds`.
+    """Check a plan for the samples and for all `corner_cases`, or make one with `plan_for_bounds`.
 
     A plan that is given may end before the light does: later light is not recorded.
 
@@ -170,10 +178,13 @@ def checked_plan(
         check_samples(plan, time)
         return plan
     check_samples(plan, time)
-    # The first scene is the start itself.
-    for number, corner in enumerate(corner_scenes(scene, unknowns)):
+    pulse_changes = any(u.setter.of_lidar for u in unknowns)
+    # The first case is the start itself.
+    for number, corner in enumerate(corner_cases(lidar, scene, unknowns)):
         try:
-            check_reach(plan, lidar, corner)
+            check_reach(plan, *corner)
+            if pulse_changes:
+                check_pulse(plan, *corner)
         except ValueError as error:
             position = "at the bounds of the unknowns " if number else ""
             raise ValueError(

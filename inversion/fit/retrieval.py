@@ -197,7 +197,7 @@ def checked_problem(
     check_kind("recorder", recorder, Recorder | None, "a Recorder, or None")
     has_offset = recorder is not None and recorder.offset is not None
     observation = as_observed(observed, time, noise, noise_floor, lidar, has_offset=has_offset)
-    bound_unknowns = bind_unknowns(unknowns, scene)
+    bound_unknowns = bind_unknowns(unknowns, scene, lidar)
     check_solver_for(bound_unknowns, settings)
     check_names(recorder, bound_unknowns)
     # A list of none or one, as the recorder appends it to its own unknowns.

@@ -181,7 +181,12 @@ def retrieve_many(
     # neither stacked nor sent to workers more often than needed.
     lidars = [with_fixed_window(a) for a in _one_or_each("lidar", lidar, Lidar, n_footprints)]
     scenes = _one_or_each("scene", scene, Scene, n_footprints)
-    bound = [bind_unknowns(unknowns, s) for s in scenes]
+    bound = [bind_unknowns(unknowns, a, lidars[0]) for a in scenes]
+    if any(unknown.setter.of_lidar for unknown in bound[0]):
+        # They start from the lidar of each footprint.
+        indices = range(max(len(lidars), len(scenes)))
+        cases = [(_of_footprint(scenes, i), _of_footprint(lidars, i)) for i in indices]
+        bound = [bind_unknowns(unknowns, *case) for case in cases]
     bound = _with_starts(bound, {} if start is None else start, n_footprints)
     check_solver_for(bound[0], settings)
     recorders: list[Recorder | None] = (

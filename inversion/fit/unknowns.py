@@ -1,11 +1,11 @@
-"""Unknowns of a retrieval: bounds, priors and starting values, and the way a value enters the scene.
+"""Unknowns of a retrieval: bounds, priors and starting values, and the way a value enters the simulation.
 
 **Bounds.** A fit moves in the natural units of the unknowns and keeps within their bounds
 (`inversion.fit.solver`).
 
-**Scene.** `bind_unknowns` locates every `Unknown` in a scene and gives a `BoundUnknown`, whose `Setter` puts
-a value into the scene. Setters are hashable and equal for equal unknowns, so that programs compiled for one
-fit serve the next.
+**Scene and lidar.** `bind_unknowns` locates every `Unknown` in a scene or a lidar and gives a `BoundUnknown`,
+whose `Setter` puts a value there. Setters are hashable and equal for equal unknowns, so that programs
+compiled for one fit serve the next.
 """
 
 import difflib
@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from inversion.fit.priors import LogNormal, MarkovField, Smooth
-from jaxlidar import Scene
+from jaxlidar import Lidar, Scene
 from jaxlidar.extend import Converted, as_array, check_kind, check_range
 
 # (mean, standard deviation), or one of the named priors.
@@ -27,6 +27,11 @@ Prior = tuple[Float[Array, "..."], Float[Array, "..."]] | LogNormal | Smooth | M
 # Least distance of a starting value from its bounds, over the bounds' width: at a bound, such as a
 # reflectance of zero, the waveform may not depend on other unknowns.
 MARGIN = 0.01
+# Beginning of a path in the lidar.
+_OF_LIDAR = "lidar."
+# Fields of a lidar whose arrays can be unknown: those that act after the trace, and those that move rays.
+_LATE_FIELDS = ("pulse", "jitter")
+_RAY_FIELDS = ("position", "altitude", "zenith", "azimuth", "divergence", "field_of_view")
 
 
 def _as_bounds(x: Any) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
@@ -55,7 +60,8 @@ def _as_optional_start(x: ArrayLike | None) -> Float[Array, "..."] | None:
 
 @final
 class Unknown(eqx.Module):
-    """An unknown of a retrieval: an array of the scene, or a value that a function puts into the scene.
+    """An unknown of a retrieval: an array of the scene or of the lidar, or a value that a function puts into
+    the scene.
 
     A start on a bound, or closer to it than 1 % of the bounds' width, is moved to that distance.
 
@@ -63,7 +69,10 @@ class Unknown(eqx.Module):
 
     - `where`: path of one array in the scene, of any shape, such as "canopy.leaf.Cab" or "plates[0].height",
       or a function that picks the array, as for `equinox.tree_at`. An element of an array, or a property, is
-      not such an array: use `apply`. Default None.
+      not such an array: use `apply`. A path that begins with "lidar." is one of the lidar, for the retrieval
+      of one record: "lidar.position", "lidar.zenith", "lidar.azimuth", "lidar.altitude", "lidar.divergence",
+      "lidar.field_of_view", "lidar.jitter", or an array of the pulse, such as "lidar.pulse.fwhm". Default
+      None.
     - `bounds`: (low, high) in the unknown's own unit, finite, low below high, numbers or arrays that
       broadcast to the value.
     - `name`: key of the result; needed with `apply`. Default None: the path of `where`.
@@ -141,20 +150,22 @@ Dependence = Literal["optical", "extinction", "geometric"]
 
 
 class Setter(NamedTuple):
-    """The way in which a value enters the scene: hashable, and equal for equal unknowns.
+    """The way in which a value enters the simulation: hashable, and equal for equal unknowns.
 
-    - `array_index`: index of the array, among the scene's pytree leaves, that the value replaces, or None
-      with `apply`.
+    - `array_index`: index of the array, among the pytree leaves of the scene or of the lidar, that the value
+      replaces, or None with `apply`.
     - `apply`: function that puts the value into the scene, or None with `array_index`. Both are None for
       unknowns that are not of the scene, such as the receiver's.
     - `dependence`: means by which the value acts on the simulation. "optical": it only weights the traced
       histories of light; "extinction": it changes the weights of paths of light; "geometric": it changes the
       paths.
+    - `of_lidar`: True if the array is one of the lidar. Default False.
     """
 
     array_index: int | None
     apply: Callable[[Scene, Array], Scene] | None
     dependence: Dependence
+    of_lidar: bool = False
 
     @property
     def changes_response(self) -> bool:
@@ -188,10 +199,13 @@ class BoundUnknown(NamedTuple):
         return float(np.mean(self.start)) if self.smooth_level is None else self.smooth_level
 
 
-def bind_unknowns(unknowns: Sequence[Unknown], scene: Scene, *, of_maps: bool = False) -> list[BoundUnknown]:
-    """Locate the unknowns in the scene.
+def bind_unknowns(
+    unknowns: Sequence[Unknown], scene: Scene, lidar: Lidar | None = None, *, of_maps: bool = False
+) -> list[BoundUnknown]:
+    """Locate the unknowns in the scene and the lidar.
 
-    `of_maps`: True for a fit of many records, which takes a `MarkovField` and no `Smooth`.
+    `lidar`: None where its arrays cannot be unknown. `of_maps`: True for a fit of many records, which takes a
+    `MarkovField` and no `Smooth`.
 
     **Raises:** ValueError for unknowns that cannot be retrieved.
     """
@@ -207,17 +221,17 @@ def bind_unknowns(unknowns: Sequence[Unknown], scene: Scene, *, of_maps: bool = 
         ("optical", optical_arrays(scene)),
         ("extinction", extinction_arrays(scene)),
     ]
-    bound = [_bind(u, scene, arrays_by_dependence) for u in unknowns]
+    bound = [_bind(u, scene, lidar, arrays_by_dependence) for u in unknowns]
     names = [u.name for u in bound]
     for name in names:
         if names.count(name) > 1:
             raise ValueError(f"name = {name!r} is given to {names.count(name)} unknowns; each needs its own")
     # Two values for one array: the second would overwrite the first. Not so with `apply`, which may scale
     # what another unknown has set.
-    indices = [u.setter.array_index for u in bound if u.setter.array_index is not None]
-    for u in bound:
-        if u.setter.array_index is not None and indices.count(u.setter.array_index) > 1:
-            raise ValueError(f"unknown {u.name!r} picks an array of the scene that another one picks as well")
+    places = [(u.setter.of_lidar, u.setter.array_index) for u in bound]
+    for u, place in zip(bound, places):
+        if u.setter.array_index is not None and places.count(place) > 1:
+            raise ValueError(f"unknown {u.name!r} picks an array that another one picks as well")
     return bound
 
 
@@ -232,30 +246,35 @@ def _check_prior_kind(unknown: Unknown, of_maps: bool) -> None:
 
 
 def _bind(
-    u: Unknown, scene: Scene, arrays_by_dependence: list[tuple[Dependence, frozenset[int]]]
+    u: Unknown,
+    scene: Scene,
+    lidar: Lidar | None,
+    arrays_by_dependence: list[tuple[Dependence, frozenset[int]]],
 ) -> BoundUnknown:
-    """Locate one unknown in the scene.
+    """Locate one unknown in the scene or the lidar.
 
     1. Find the arrays that it changes, its name and its start.
     2. Broadcast bounds and prior to the shape of the start.
     3. Classify it by the arrays that it changes.
     """
-    array_index, name, start = None, u.name, u.start
+    array_index, name, start, of_lidar = None, u.name, u.start, False
     if u.where is None:
         changed_arrays = _changed_arrays(u, scene)
     else:
-        array_index, path = _locate(u.where, scene, u.name)
+        of_lidar = isinstance(u.where, str) and u.where.startswith(_OF_LIDAR)
+        if of_lidar:
+            array_index, path, initial = _locate_in_lidar(str(u.where), lidar, u.name)
+        else:
+            array_index, path = _locate(u.where, scene, u.name)
+            initial = jax.tree.leaves(scene)[array_index]
         changed_arrays = frozenset([array_index])
         name = path if name is None else name
         # Integers have no derivative.
-        scene_value = jax.tree.leaves(scene)[array_index]
-        if not eqx.is_inexact_array(scene_value):
+        if not eqx.is_inexact_array(initial):
             raise ValueError(
-                f"unknown {name!r} is {scene_value!r}; admissible is a floating-point array of the scene"
+                f"unknown {name!r} is {initial!r}; admissible is a floating-point array of the scene"
             )
-        start = (
-            as_array(scene_value) if start is None else _broadcast(name, "start", start, scene_value.shape)
-        )
+        start = as_array(initial) if start is None else _broadcast(name, "start", start, initial.shape)
     assert name is not None
     assert start is not None
     low, high = (np.asarray(_broadcast(name, "bounds", b, start.shape), float) for b in u.bounds)
@@ -283,7 +302,9 @@ def _bind(
         prior = (np.log(mean) if is_log_prior else mean), std
     # The first kind that covers all changed arrays; a mixture is geometric.
     matches: list[Dependence] = [kind for kind, arrays in arrays_by_dependence if changed_arrays <= arrays]
-    setter = Setter(array_index, u.apply, matches[0] if matches else "geometric")
+    if of_lidar:
+        matches = ["optical"] if _field_of_lidar(str(u.where)) in _LATE_FIELDS else []
+    setter = Setter(array_index, u.apply, matches[0] if matches else "geometric", of_lidar)
     field = u.prior if isinstance(u.prior, MarkovField) else None
     bound = BoundUnknown(name, setter, start, low, high, prior, is_log_prior, smooth, field=field)
     return with_start(bound, start)
@@ -340,6 +361,26 @@ def _locate(where: str | Callable, scene: Scene, name: str | None) -> tuple[int,
             return i, paths[i]
     kind = "nothing (None)" if picked is None else f"a {type(picked).__name__}"
     raise ValueError(f"{label}: where picks {kind}; admissible is one array of the scene")
+
+
+def _field_of_lidar(where: str) -> str:
+    """Return the name of the lidar's field in a path such as "lidar.pulse.fwhm"."""
+    return where.removeprefix(_OF_LIDAR).split(".")[0]
+
+
+def _locate_in_lidar(where: str, lidar: Lidar | None, name: str | None) -> tuple[int, str, Array]:
+    """Return the index among the lidar's pytree leaves, the path and the value of an array of the lidar."""
+    label = _label(name)
+    if lidar is None:
+        raise ValueError(f"{label}: where = {where!r}; admissible here are arrays of the scene")
+    leaves = jax.tree_util.tree_leaves_with_path(lidar)
+    paths = [_OF_LIDAR + jax.tree_util.keystr(path).lstrip(".") for path, _ in leaves]
+    admissible = [path for path in paths if _field_of_lidar(path) in (*_RAY_FIELDS, *_LATE_FIELDS)]
+    if where not in admissible:
+        raise ValueError(f"{label}: where = {where!r}; admissible are {', '.join(map(repr, admissible))}")
+    index = paths.index(where)
+    # Positions are kept in double precision.
+    return index, where, as_array(leaves[index][1])
 
 
 def _changed_arrays(u: Unknown, scene: Scene) -> frozenset[int]:
@@ -401,17 +442,30 @@ def extinction_arrays(scene: Scene) -> frozenset[int]:
 
 
 def set_values(scene: Scene, setters: tuple[Setter, ...], values: tuple[Array, ...]) -> Scene:
-    """Return the scene with the values of the unknowns, applied in their order."""
+    """Return the scene with the values of its unknowns, applied in their order."""
     for setter, value in zip(setters, values):
         if setter.apply is not None:
             scene = setter.apply(scene, value)
-        else:
-            assert setter.array_index is not None
+        elif not setter.of_lidar:
             # Flattened for each value: an earlier `apply` may have replaced arrays.
-            leaves, structure = jax.tree.flatten(scene)
-            leaves[setter.array_index] = value
-            scene = jax.tree.unflatten(structure, leaves)
+            scene = _with_array(scene, setter, value)
     return scene
+
+
+def set_lidar_values(lidar: Lidar, setters: tuple[Setter, ...], values: tuple[Array, ...]) -> Lidar:
+    """Return the lidar with the values of its unknowns."""
+    for setter, value in zip(setters, values):
+        if setter.of_lidar:
+            lidar = _with_array(lidar, setter, value)
+    return lidar
+
+
+def _with_array(tree: Any, setter: Setter, value: Array) -> Any:
+    """Return a scene or a lidar with one array replaced."""
+    assert setter.array_index is not None
+    leaves, structure = jax.tree.flatten(tree)
+    leaves[setter.array_index] = value
+    return jax.tree.unflatten(structure, leaves)
 
 
 # -- flattened unknowns: one vector of all values, in the order of the unknowns

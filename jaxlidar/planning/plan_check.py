@@ -37,6 +37,14 @@ def check_reach(plan: Plan, lidar: Lidar, scene: Scene) -> None:
     _check(plan, lidar, scene, (_misfit_materials, _misfit_lengths))
 
 
+def check_pulse(plan: Plan, lidar: Lidar, scene: Scene) -> None:
+    """Refuse a plan that does not fit the pulse of a lidar.
+
+    **Raises:** ValueError that names what does not fit, with numbers.
+    """
+    _check(plan, lidar, scene, (_misfit_pulse,))
+
+
 def _check(plan: Plan, lidar: Lidar, scene: Scene, checks: Sequence[Callable]) -> None:
     check_footprints_on_terrain(lidar, scene)
     ground = scene.ground

@@ -25,12 +25,14 @@ from jaxlidar.scenes.scene import Scene, check_kinds
 
 
 def union_plan(
-    lidar: Lidar, scenes: Sequence[Scene], plans: Sequence[Plan], survey: Survey | None = None
+    cases: Sequence[tuple[Lidar, Scene]], plans: Sequence[Plan], survey: Survey | None = None
 ) -> Plan:
-    """Return the first plan with fine time bins and loops that are long enough for the scenes of all plans.
+    """Return the first plan with fine time bins and loops that are long enough for the cases of all plans.
 
     The plans share the width of their bins, the number of orders and the samples. Scatterer channels are
     those of the first. With a `survey` the plans are those of all its shots.
+
+    **Arguments:** `cases`: the lidar and the scene of each plan.
     """
     first = plans[0]
     # All plans share the bin width, so that the union of their bins is a whole number of bins.
@@ -44,7 +46,8 @@ def union_plan(
     )
     start_distance = max(p.limits.start_distance for p in plans)
     max_path = max(p.limits.max_path for p in plans)
-    path_lengths = [PathLengths(lidar, s, survey) for s in scenes]
+    path_lengths = [PathLengths(lidar, scene, survey) for lidar, scene in cases]
+    supports = [p.pulse_support for p in plans]
     # Rays start above the scene: the distance down to it is part of the path.
     longest = max_path + start_distance
     united = first.with_limits(
@@ -52,13 +55,16 @@ def union_plan(
         max_path=max_path,
         max_flight=max(p.longest_flight(longest) for p in path_lengths),
     ).with_config(
+        vertical=all(p.config.vertical for p in plans),
         max_ray_segments=max(p.config.max_ray_segments for p in plans),
         # A bucket of sizes, so that simulations of similar scenes share a compiled program.
         max_faces=size_bucket(max(p.max_faces(longest) for p in path_lengths)),
         # A sheet that lets light through in any scene must be able to.
         covers_fully=tuple(all(c) for c in zip(*(p.config.covers_fully for p in plans))),
     )
-    return dataclasses.replace(united, bins=bins)
+    pulse_support = (min(low for low, _ in supports), max(high for _, high in supports))
+    scope = united.scope._replace(pulse_feature=min(p.scope.pulse_feature for p in plans))
+    return dataclasses.replace(united, bins=bins, pulse_support=pulse_support, scope=scope)
 
 
 def plan_scenes(
@@ -122,7 +128,7 @@ def plan_scenes(
         common["max_step"] = max(p.limits.max_segment for p in trials)
     order = [first, *(i for i in range(len(trials)) if i != first)]
     plans = [_plan_of(lidar, examined[i], common) for i in order]
-    united = union_plan(lidar, [examined[i] for i in order], plans)
+    united = union_plan([(lidar, examined[i]) for i in order], plans)
     scope = united.scope._replace(
         first_return=min(p.scope.first_return for p in trials),
         last_return=max(p.scope.last_return for p in trials),

@@ -13,7 +13,7 @@ import inversion
 import jaxlidar as jl
 from inversion import Unknown
 from inversion.fit.model import ForwardModel
-from inversion.fit.planning import TraceSizes, corner_scenes, plan_for_bounds
+from inversion.fit.planning import TraceSizes, corner_cases, plan_for_bounds
 from inversion.fit.solver import latin_hypercube
 from inversion.fit.uncertainty import estimate_covariance
 from inversion.fit.unknowns import bind_unknowns, optical_arrays
@@ -398,7 +398,7 @@ def test_the_plan_serves_the_corners_of_the_bounds():
     sizes = TraceSizes(64, 64, max_orders=2)
     plan = plan_for_bounds(LIDAR, scene, bound, time, sizes)
     assert plan.n_samples == time.size
-    scenes = corner_scenes(scene, bound)
+    scenes = [corner for _, corner in corner_cases(LIDAR, scene, bound)]
     assert len(scenes) == 17
     for corner in scenes:
         corner_plan = jl.plan(
@@ -415,7 +415,7 @@ def test_the_plan_serves_the_corners_of_the_bounds():
         assert end <= longest + 1e-6
     # More than four unknowns: each at its bounds alone, and all together.
     unknowns += [Unknown(name="leaf area", bounds=(0.1, 5.0), start=1.0, apply=scale_leaf_area)]
-    assert len(corner_scenes(scene, bind_unknowns(unknowns, scene))) == 13
+    assert len(corner_cases(LIDAR, scene, bind_unknowns(unknowns, scene))) == 13
     high = [Unknown(lambda s: s.ground.height, bounds=(-1.0, 1000.0))]
     with pytest.raises(ValueError, match="at the bounds of the unknowns the scene is inadmissible: altitude"):
         plan_for_bounds(LIDAR, scene, bind_unknowns(high, scene), time, sizes)
