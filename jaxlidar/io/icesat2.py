@@ -39,6 +39,8 @@ PULSE_RATE = 1e4
 _MAX_NUMBER, _MAX_INTEGER = 1e30, 2**31 - 1
 # Largest height, and distance within a segment, m.
 _MAX_HEIGHT = 1e5
+# Largest time, s since the beginning of 2018: three centuries.
+_MAX_TIME = 1e10
 # Histogram bins of the transmitter echo around its largest one that hold the impulse, ns.
 _IMPULSE_RANGE = (-10.0, 30.0)
 # Stands for a missing integer.
@@ -77,7 +79,8 @@ class PhotonTrack:
     - `height`: (photons,) m above the ellipsoid of WGS-84.
     - `latitude`, `longitude`: (photons,) degrees.
     - `time`: (photons,) s since the beginning of 2018.
-    - `pulse`: (photons,) number of the laser pulse, from 0 for the first one that was read.
+    - `pulse`: (photons,) number of the laser pulse, from 0 for the first one that was read; by time where the
+      file lacks numbers.
     - `confidence`: (photons,) the product's confidence that a photon is signal of the surface: 0 noise, 1
       buffer, 2 low, 3 medium, 4 high; below 0 not of this surface, or possibly of the transmitter echo.
     - `quality`: (photons,) the product's flag, 0 nominal.
@@ -229,21 +232,24 @@ def read_atl03(
         height, along = _without_fills(photons_of("h_ph")), _without_fills(photons_of("dist_ph_along"))
         # Written so that NaN is left out.
         has_place = (np.abs(height) <= _MAX_HEIGHT) & (np.abs(along) <= _MAX_HEIGHT)
+        time = photons_of("delta_time")
+        has_place &= np.abs(time) <= _MAX_TIME
         is_complete = np.isin(segment, chosen) & has_place
         incomplete = int(np.sum(~has_place))
         if incomplete:
             warn_of_file(
-                f"{file.location(f'{beam}/heights')}: {incomplete} of {height.size} photons have no height "
-                "or no distance: they are left out"
+                f"{file.location(f'{beam}/heights')}: {incomplete} of {height.size} photons have no height, "
+                "no distance or no time: they are left out"
             )
-        time = photons_of("delta_time")
         confidence = photons_of("signal_conf_ph", len(SURFACES))[:, SURFACES.index(surface)]
         quality = (
             photons_of("quality_ph") if file.has(f"{beam}/heights/quality_ph") else np.zeros(height.size)
         )
         names = ("pce_mframe_cnt", "ph_id_pulse")
         has_pulses = all(file.has(f"{beam}/heights/{name}") for name in names)
-        pulse = _pulses(*map(photons_of, names)) if has_pulses else _pulses_by_time(time)
+        pulse = _pulses(*map(photons_of, names)) if has_pulses else np.full(time.shape, _NO_INTEGER)
+        if np.any(pulse[is_complete] == _NO_INTEGER):
+            pulse = _pulses_by_time(np.where(is_complete, time, np.nan))
         background = _background_rate(file, beam, time)
         width = segments_of("tx_pulse_width_lower", needed=False)
         places = {name: photons_of(field)[is_complete] for name, field in _PLACES.items()}
@@ -365,7 +371,7 @@ def _pulses(frame: np.ndarray, number: np.ndarray) -> np.ndarray:
 
 
 def _pulses_by_time(time: np.ndarray) -> np.ndarray:
-    """Return numbers of the laser pulses of photons in a subset without the product's frames."""
+    """Return numbers of the laser pulses of photons in a file without the product's frames."""
     finite_time = time[np.isfinite(time)]
     first = float(finite_time.min()) if finite_time.size else 0.0
     with np.errstate(over="ignore", invalid="ignore"):

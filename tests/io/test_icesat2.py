@@ -177,7 +177,27 @@ def test_numbers_that_overflow_are_missing(tmp_path):
         warnings.simplefilter("error")
         track = read_atl03(path)
     assert track.impulse is None
-    assert len(set(track.pulse.tolist())) == 1
+    assert track.pulse.tolist() == list(range(9))
+
+
+def test_pulses_without_a_number_are_numbered_by_time(tmp_path):
+    """A number for what is missing would lie far from the others, and pulses are counted between them."""
+    path = write_photons(tmp_path / "atl03.h5")
+    with h5py.File(path, "r+") as file:
+        del file["gt1r/heights/ph_id_pulse"]
+        file["gt1r/heights/ph_id_pulse"] = np.where(np.arange(9) == 4, np.nan, 1.0 + np.arange(9))
+        file["gt1r/heights/delta_time"][6:] += 0.02
+    assert read_atl03(path).pulse.tolist() == [0, 1, 2, 3, 4, 5, 206, 207, 208]
+
+
+@pytest.mark.parametrize("missing", [np.nan, 1e300])
+def test_photons_without_a_time_are_left_out(tmp_path, missing):
+    path = write_photons(tmp_path / "atl03.h5")
+    with h5py.File(path, "r+") as file:
+        file["gt1r/heights/delta_time"][0] = missing
+    with pytest.warns(FileWarning, match="1 of 9 photons have no height, no distance or no time"):
+        track = read_atl03(path)
+    assert track.pulse.tolist() == list(range(8))
 
 
 def test_a_signalling_nan_of_the_impulse_is_missing(tmp_path):
