@@ -105,6 +105,13 @@ def voxel_scene(tree: jl.Tree, edge: float, kind: str) -> jl.Scene:
     return jl.Scene(canopy=canopy, ground=jl.Ground(reflectance=GROUND))
 
 
+def scene_size(scene: jl.Scene) -> int:
+    """Return the number of triangles, or of voxels."""
+    if scene.canopy is not None:
+        return int(np.prod(scene.canopy.voxels.shape))
+    return sum(surface.n_triangles for surface in scene.meshes)
+
+
 def simulations(footprint: Footprint, scene: jl.Scene, key: jax.Array, runs: int, photons: int) -> Runs:
     """Simulate a footprint with independent keys."""
     lidar = footprint.lidar()
@@ -265,7 +272,7 @@ def main() -> None:
                 results.append(simulations(footprint, scene, run_key, choices.runs, choices.photons))
             elapsed = time.perf_counter() - start
             reference = reference or results
-            size = scene.meshes[0].n_triangles if scene.meshes else int(np.prod(scene.canopy.voxels.shape))
+            size = scene_size(scene)
             seconds = {"seconds to make": seconds, "seconds to simulate": elapsed}
             sizes.append({**names, "size": size, **seconds})
             height = results[0].height

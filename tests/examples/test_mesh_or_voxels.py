@@ -27,7 +27,8 @@ def test_triangles_and_voxels_have_the_same_leaf_area(benchmark):
     (mesh,) = benchmark.mesh_scene(tree).meshes
     is_leaf = mesh.group == mesh.materials.index("leaf")
     corners = np.asarray(mesh.vertices)[np.unique(np.c_[mesh.group, mesh.faces][is_leaf], axis=0)[:, 1:]]
-    area = 0.5 * np.linalg.norm(np.cross(*(corners[:, k] - corners[:, 0] for k in (1, 2))), axis=1).sum()
+    first, second = (corners[:, k] - corners[:, 0] for k in (1, 2))
+    area = 0.5 * np.linalg.norm(np.cross(first, second), axis=1).sum()
     voxels = {kind: benchmark.voxel_scene(tree, 0.2, kind).canopy.voxels for kind in benchmark.KINDS}
     leaf_areas = {kind: 2 * float(v.leaf.sum()) * 0.2**3 for kind, v in voxels.items()}
     assert leaf_areas["by area"] == pytest.approx(area, rel=1e-4)
