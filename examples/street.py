@@ -170,12 +170,12 @@ def draw(returns: jl.DiscreteReturns, of_voxels: jl.DiscreteReturns, scene: jl.S
     look = {"colour_by": "material", "legend": False}
     # The street is wide and low: a square with equal scales is larger than the picture.
     oblique = upper.add_axes((-0.2, -0.65, 1.4, 2.3), projection="3d")
-    jaxlidar.plot.points(returns, oblique, view="oblique", elevation=35.0, azimuth=200.0, size=2.0, **look)
+    jaxlidar.plot.points(returns, oblique, view="oblique", elevation=35.0, azimuth=200.0, size=2.5, **look)
     wires, line = middle.subplots(), ((0.0, POLE_Y), (LENGTH, POLE_Y))
     jaxlidar.plot.section(returns, *line, wires, width=2.5, scene=scene, size=2.5, **look)
     wires.set_title("along the wires, 2.5 m wide", fontsize="medium")
     above, *trees = lower.subplots(1, 3, width_ratios=(1.7, 1.0, 1.0))
-    jaxlidar.plot.points(returns, above, size=1.2, **look)
+    jaxlidar.plot.points(returns, above, size=1.6, **look)
     x, y, *_ = TREES[0]
     kinds = {"triangles": returns, f"voxels of {VOXEL_SIZE:g} m": of_voxels}
     for ax, (kind, points) in zip(trees, kinds.items()):
@@ -193,7 +193,7 @@ def draw(returns: jl.DiscreteReturns, of_voxels: jl.DiscreteReturns, scene: jl.S
 def main(arguments: Sequence[str] | None = None) -> jl.DiscreteReturns:
     """Scan the street, print numbers, draw the figure and return the discrete returns."""
     parser = argparse.ArgumentParser(description="Fly a scanner over a street.")
-    parser.add_argument("--spacing", type=float, default=0.5, help="distance of shots of a strip, m")
+    parser.add_argument("--spacing", type=float, default=0.7, help="distance of shots of a strip, m")
     parser.add_argument("--out", type=Path, default=Path("."), help="folder of the figure")
     options = parser.parse_args(arguments)
     survey, scene = flight(options.spacing), street()
@@ -210,7 +210,7 @@ def main(arguments: Sequence[str] | None = None) -> jl.DiscreteReturns:
         print(f"tree of {kind}: {heights.size} returns, mean height {heights.mean():.2f} m")
     options.out.mkdir(parents=True, exist_ok=True)
     with atomic_write(options.out / "street.png") as draft:
-        draw(returns, of_voxels, scene).savefig(draft, dpi=72, format="png")
+        draw(returns, of_voxels, scene).savefig(draft, dpi=80, format="png")
     return returns
 
 
