@@ -1,5 +1,7 @@
 """Worker of `peers.py`: the same scene rendered by Mitsuba 3 with mitransient.
 
+A task is the crown of `peers.py`, or some meshes ("meshes": paths of files), with a beam at a zenith angle.
+
 Laser and receiver are at one point. Their roles are exchanged, by reciprocity: the sensor sends its rays
 uniformly over the disc of the laser, and a point emitter stands for the receiver, which sees everything. No
 ray is then wasted, and every scattering is connected with the receiver. `"camera"` is the set-up that a user
@@ -61,15 +63,30 @@ def register_corrected_plugin() -> bool:
     return True
 
 
-def register_beam(mi, altitude: float, radius: float) -> None:
-    """Register a sensor whose rays leave one point and are uniform over a disc on the reference plane."""
+def axes_of_beam(task) -> tuple[np.ndarray, np.ndarray]:
+    """Return the position of the sensor, m, and unit vectors in rows: two across the beam, and its direction.
+
+    The beam is aimed at the origin, and travels to the east where it is not vertical.
+    """
+    zenith = np.deg2rad(float(task.get("zenith", 0.0)))
+    sine, cosine = np.sin(zenith), np.cos(zenith)
+    axes = np.array([[cosine, 0.0, sine], [0.0, 1.0, 0.0], [sine, 0.0, -cosine]])
+    return -float(task["altitude"]) / cosine * axes[2], axes
+
+
+def register_beam(mi, task) -> None:
+    """Register a sensor whose rays leave one point and are uniform over a disc across the beam's axis."""
     import drjit as dr
+
+    radius, (position, axes) = float(task["radius"]), axes_of_beam(task)
+    distance = float(np.linalg.norm(position))
+    first, second, axis = (mi.Vector3f(*a) for a in axes.tolist())
 
     class DiscBeam(mi.Sensor):
         def sample_ray(self, time, sample1, sample2, sample3, active=True):
             across = radius * mi.warp.square_to_uniform_disk(sample2)
-            down = dr.normalize(mi.Vector3f(across.x, across.y, -altitude))
-            return mi.RayDifferential3f(mi.Point3f(0, 0, altitude), down, time, []), mi.Spectrum(1.0)
+            direction = dr.normalize(across.x * first + across.y * second + distance * axis)
+            return mi.RayDifferential3f(mi.Point3f(*position.tolist()), direction, time, []), mi.Spectrum(1.0)
 
         def sample_ray_differential(self, *arguments, **named):
             return self.sample_ray(*arguments, **named)
@@ -80,32 +97,44 @@ def register_beam(mi, altitude: float, radius: float) -> None:
     mi.register_sensor("disc_beam", DiscBeam)
 
 
-def scene(mi, task, reflectance: float, camera: bool, plugin: str):
-    """Return the scene; a Lambertian target of reflectance rho that fills the footprint has radiance rho."""
-    move = mi.ScalarTransform4f
-    altitude, radius, size = (float(task[n]) for n in ("altitude", "radius", "size"))
+def instrument(mi, task, camera: bool = False) -> dict:
+    """Return sensor and light.
+
+    A Lambertian target of reflectance rho that fills the footprint has the radiance rho.
+    """
+    position, _ = axes_of_beam(task)
+    distance, radius = float(np.linalg.norm(position)), float(task["radius"])
     start, width, count = (float(task[n]) for n in ("start", "fine", "count"))
-    down = move().look_at(origin=[0, 0, altitude], target=[0, 0, 0], up=[0, 1, 0])
-    half = float(np.degrees(np.arctan(radius / altitude)))
     film = {
         "type": "transient_hdr_film",
         "width": 1,
         "height": 1,
         "temporal_bins": int(count),
-        "start_opl": 2 * altitude + start * SPEED_OF_LIGHT,
+        "start_opl": 2 * distance + start * SPEED_OF_LIGHT,
         "bin_width_opl": width * SPEED_OF_LIGHT,
         "rfilter": {"type": "box"},
     }
     sampler = {"type": "independent"}
-    power = np.pi * altitude**2
-    sensor = {"type": "disc_beam", "film": film, "sampler": sampler}
-    light = {"type": "point", "position": [0, 0, altitude], "intensity": power}
-    if camera:
-        # The camera averages over its square, of which the footprint covers pi / 4.
-        square = {"type": "perspective", "fov": 2 * half, "to_world": down, "film": film}
-        sensor = {**square, "sampler": sampler}
-        light = {"type": "spot", "to_world": down, "cutoff_angle": half, "beam_width": 0.9999 * half}
-        light["intensity"] = power * 4 / np.pi
+    power = np.pi * distance**2
+    if not camera:
+        light = {"type": "point", "position": position.tolist(), "intensity": power}
+        return {"sensor": {"type": "disc_beam", "film": film, "sampler": sampler}, "light": light}
+    # The camera averages over its square, of which the footprint covers pi / 4.
+    half = float(np.degrees(np.arctan(radius / distance)))
+    down = mi.ScalarTransform4f().look_at(origin=position.tolist(), target=[0, 0, 0], up=[0, 1, 0])
+    square = {"type": "perspective", "fov": 2 * half, "to_world": down, "film": film}
+    light = {"type": "spot", "to_world": down, "cutoff_angle": half, "beam_width": 0.9999 * half}
+    return {"sensor": {**square, "sampler": sampler}, "light": {**light, "intensity": power * 4 / np.pi}}
+
+
+def integrator(plugin: str, orders: int) -> dict:
+    """Return the integrator: depth n means n - 1 scatterings. Russian roulette does not pay here."""
+    return {"type": plugin, "max_depth": int(orders) + 1, "rr_depth": 1000}
+
+
+def crown(mi, task, reflectance: float, camera: bool, plugin: str):
+    """Return the scene of a crown."""
+    move, size = mi.ScalarTransform4f, float(task["size"])
     # Axes of a grid are z, y, x.
     grid = np.ascontiguousarray(task["extinction"].transpose(2, 1, 0), dtype=np.float32)[..., None]
     box = move().translate([-size / 2, -size / 2, 0]).scale(size)
@@ -116,10 +145,8 @@ def scene(mi, task, reflectance: float, camera: bool, plugin: str):
     hull = move().translate([0, 0, (size + gap) / 2]).scale([size / 2, size / 2, (size - gap) / 2])
     scene_dict = {
         "type": "scene",
-        # Depth n means n - 1 scatterings. No Russian roulette (rr_depth): it does not pay here.
-        "integrator": {"type": plugin, "max_depth": int(task["orders"]) + 1, "rr_depth": 1000},
-        "sensor": sensor,
-        "light": light,
+        "integrator": integrator(plugin, task["orders"]),
+        **instrument(mi, task, camera),
         "box": {
             "type": "cube",
             "to_world": hull,
@@ -133,31 +160,54 @@ def scene(mi, task, reflectance: float, camera: bool, plugin: str):
     return mi.load_dict(scene_dict)
 
 
-def main() -> None:
-    """Render every case `repeats` times; the command line names files for the task and the results."""
-    task = dict(np.load(sys.argv[1]))
-    mi, mitransient = load()
-    corrected = register_corrected_plugin()
-    register_beam(mi, float(task["altitude"]), float(task["radius"]))
-    version = f"mitransient {mitransient.__version__}, Mitsuba {mi.__version__}"
-    out: dict[str, object] = {"version": version, "corrected": corrected}
-    # The apparent reflectance refers to the range that the time of arrival stands for.
-    bin_time = task["start"] + task["fine"] * (np.arange(int(task["count"])) + 0.5)
-    range_correction = (1 + 0.5 * SPEED_OF_LIGHT * bin_time / task["altitude"]) ** 2
-    samples = int(task["mitransient_samples"])
+def meshes(mi, task, orders: int):
+    """Return the scene of meshes, whose both sides are Lambertian."""
+    surfaces = {
+        f"mesh {n}": {
+            "type": "ply",
+            "filename": str(path),
+            "face_normals": True,
+            "bsdf": {"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": float(reflectance)}},
+        }
+        for n, (path, reflectance) in enumerate(zip(task["meshes"], task["reflectances"]))
+    }
+    path_tracer = integrator("transient_path", orders)
+    return mi.load_dict({"type": "scene", "integrator": path_tracer, **instrument(mi, task), **surfaces})
+
+
+def scenes(mi, task, plugin: str):
+    """Yield the name and the scene of each case of a task."""
+    if "meshes" in task:
+        for case, orders in zip(task["cases"], task["orders"]):
+            yield str(case), meshes(mi, task, orders)
+        return
     for case, reflectance, camera in (
         ("ground", float(task["reflectance"]), False),
         ("alone", 0.0, False),
         ("camera", float(task["reflectance"]), True),
     ):
-        if case not in task.get("cases", (case,)):
-            continue
-        target = scene(mi, task, reflectance, camera, CORRECTED_PLUGIN if corrected else PLUGIN)
-        integrator = target.integrator()
+        if case in task.get("cases", (case,)):
+            yield case, crown(mi, task, reflectance, camera, plugin)
+
+
+def main() -> None:
+    """Render every case `repeats` times; the command line names files for the task and the results."""
+    task = dict(np.load(sys.argv[1]))
+    mi, mitransient = load()
+    corrected = register_corrected_plugin()
+    register_beam(mi, task)
+    version = f"mitransient {mitransient.__version__}, Mitsuba {mi.__version__}"
+    out: dict[str, object] = {"version": version, "corrected": corrected}
+    # The apparent reflectance refers to the range that the time of arrival stands for.
+    bin_time = task["start"] + task["fine"] * (np.arange(int(task["count"])) + 0.5)
+    distance = np.linalg.norm(axes_of_beam(task)[0])
+    range_correction = (1 + 0.5 * SPEED_OF_LIGHT * bin_time / distance) ** 2
+    samples = int(task["mitransient_samples"])
+    for case, target in scenes(mi, task, CORRECTED_PLUGIN if corrected else PLUGIN):
         waves, times = [], []
         for seed in range(int(task["repeats"]) + 1):
             wall_start, cpu_start = time.perf_counter(), time.process_time()
-            _, image = integrator.render(target, seed=seed, spp=samples)
+            _, image = target.integrator().render(target, seed=seed, spp=samples)
             waves.append(np.array(image).ravel() * range_correction)
             times.append((time.perf_counter() - wall_start, time.process_time() - cpu_start))
         out[f"{case}_waves"], out[f"{case}_times"] = np.array(waves[1:]), np.array(times[1:])

@@ -96,9 +96,10 @@ def peers(record: dict) -> str:
     return page_of(
         "Seconds to a waveform with an error of 1 %, for jaxlidar and codes that compute the same: a crown "
         "of 64³ voxels with 15 scatterings, seen by a receiver as wide as the illuminated area, or by one "
-        "that sees everything. The other codes have features that jaxlidar lacks (meshes, any material and "
-        "camera, polarisation); they do not serve all wavelengths by one trace, and do not stop at a "
-        "tolerance.",
+        "that sees everything. The other codes have features that jaxlidar lacks (any material and camera, "
+        "polarisation); they do not serve all wavelengths by one trace, and do not stop at a tolerance. A "
+        "scene of triangles is compared in the same way on the "
+        "[page of validation](../validation/README.md#mitransient-meshes).",
         table(head, rows),
     )
 

@@ -20,11 +20,12 @@ and window, so that its seconds need no extrapolation. The first call, which com
 CPU seconds depend less on other load of the machine. Agreement is tested on sums of 5 ns (jaxlidar spreads an
 instant over three fine bins) and on totals, in standard errors of the difference.
 
-Features that only the peers have: Mitsuba takes meshes, any material, camera and emitter, polarisation, and
-images; MCX has refraction, detectors in contact and maps of fluence. Both are made for GPUs and are slower on
-a CPU. Limitations of the peers: MCX has no Lambertian ground (so that only the crown alone is compared), no
-limit of orders and no return to a distant receiver, which is computed here from its fluence; neither has the
-optics of all wavelengths from one trace, standard errors, or a stop at a tolerance.
+Features that only the peers have: Mitsuba takes any material, camera and emitter, polarisation, and images
+(`examples/validation/mitransient_meshes.py` compares a scene of meshes); MCX has refraction, detectors in
+contact and maps of fluence. Both are made for GPUs and are slower on a CPU. Limitations of the peers: MCX has
+no Lambertian ground (so that only the crown alone is compared), no limit of orders and no return to a distant
+receiver, which is computed here from its fluence; neither has the optics of all wavelengths from one trace,
+standard errors, or a stop at a tolerance.
 
 mitransient 1.3.1 leaves segments between null collisions out of path lengths. `_peer_mitransient.py` corrects
 that; if it cannot, the record says so, and only totals can be compared. The case "camera" is the set-up that
@@ -81,7 +82,7 @@ def worker_task(extinction: np.ndarray, repeats: int) -> dict:
 
 
 def run_jaxlidar(extinction: np.ndarray, case: str, pulse: float, repeats: int, orders: int = ORDERS) -> dict:
-    """Return waveforms and times of repetitions of `simulate` to 1 %."""
+    """Return waveforms and times of the crown of a case."""
     voxels = jl.VoxelMap.from_extinction(
         leaf=extinction, voxel_size=SIZE / N, origin=(-SIZE / 2, -SIZE / 2, 0.0)
     )
@@ -91,6 +92,11 @@ def run_jaxlidar(extinction: np.ndarray, case: str, pulse: float, repeats: int, 
     lidar = jl.Lidar(
         divergence=LIDAR.divergence, profile="top-hat", pulse=jl.GaussianPulse(pulse), **receiver
     )
+    return repeat_jaxlidar(lidar, scene, repeats, orders)
+
+
+def repeat_jaxlidar(lidar: jl.Lidar, scene: jl.Scene, repeats: int, orders: int) -> dict:
+    """Return waveforms and times of repetitions of `simulate` to 1 %, and the time of the first call."""
     waves, times, infos = [], [], []
     for seed in range(repeats + 1):
         start, work = time.perf_counter(), time.process_time()

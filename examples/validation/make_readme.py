@@ -16,7 +16,8 @@ FOLDER = Path(__file__).resolve().parent
 RESULTS = FOLDER / "results"
 # The order of the page: exact references first, then other codes, measurements and records.
 ORDER = (
-    *("mpmath_plate", "prosail_leaves", "discrete_ordinates", "rami4pilps", "mitransient_crown", "mcx_crown"),
+    *("mpmath_plate", "prosail_leaves", "discrete_ordinates", "rami4pilps"),
+    *("mitransient_crown", "mitransient_meshes", "mcx_crown"),
     *("leaf_databases", "recorded_gedi", "recorded_neon", "recorded_riegl", "recorded_flat", "recorded_lvis"),
     "recorded_clouds",
 )
@@ -79,8 +80,37 @@ HEADINGS = (
 )
 
 
+COST_HEADINGS = ("case", "code", "s", "error", "s to 1 %", "CPU s to 1 %", "times jaxlidar", "s, first call")
+
+
+def costs(record: dict) -> tuple[str, ...]:
+    """Return the paragraphs of what both codes cost, where a script has measured it."""
+    if "costs" not in record:
+        return ()
+    ours = {cost["case"]: cost for cost in record["costs"] if cost["code"] == "jaxlidar"}
+    lines = [
+        [
+            cost["case"],
+            cost["code"],
+            number(cost["seconds"]),
+            f"{number(100 * cost['error'])} %",
+            number(cost["seconds_to_1_percent"]),
+            number(cost["cpu_seconds_to_1_percent"]),
+            number(cost["cpu_seconds_to_1_percent"] / ours[cost["case"]]["cpu_seconds_to_1_percent"]),
+            number(cost["first_call_seconds"]),
+        ]
+        for cost in record["costs"]
+    ]
+    text = (
+        "What a waveform costs: seconds and error (root mean square over samples above 1 % of the peak) of "
+        "one repetition, the seconds of repetitions until the error is 1 %, and their ratio in CPU seconds. "
+        f"Both codes ran on the same {record['machine']['cores']} cores."
+    )
+    return text, table(COST_HEADINGS, lines)
+
+
 def section(script: str, record: dict) -> str:
-    """Return the section of one script: figure, caption, and properties that remain unchecked."""
+    """Return the section of one script: figure, caption, costs, and properties that remain unchecked."""
     software = ", ".join(f"{name} {version}" for name, version in record["versions"].items())
     code = f"; {record['code']}" if "code" in record else ""
     return page_of(
@@ -88,6 +118,7 @@ def section(script: str, record: dict) -> str:
         f"`{script}.py`: {record['title'][0].lower()}{record['title'][1:]}.",
         f"![{record['title']}](results/{script}.png)",
         record["seen"],
+        *costs(record),
         f"Unchecked: {record['unchecked']}",
         f"{record['date']}, {software}, jax {record['machine']['jax']}, "
         f"Python {record['machine']['python']}{code}.",

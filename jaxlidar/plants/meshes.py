@@ -328,12 +328,18 @@ def voxelise_mesh(
         _area_in_voxels(mesh, selected, area, grid) / size.prod() for selected in (is_leaf, is_bark)
     )
     wood = 0.25 * bark_density if np.any(is_bark) else None
-    for selected, extinction in ((is_bark, 0.25 * bark_density), (is_leaf, 0.5 * leaf_density)):
+    if np.any(is_leaf):
+        angles = _inclinations(mesh.corners[is_leaf]) if leaf_angles is None else leaf_angles
+        voxels = VoxelMap.from_lad(
+            leaf_density, bark=wood, voxel_size=size, origin=grid.low, leaf_angles=angles
+        )
+    else:
+        voxels = VoxelMap.from_extinction(bark=wood, voxel_size=size, origin=grid.low)
+    # G of the leaves straight down, which is 1/2 where they are spherical.
+    projection = 0.5 if voxels.leaf_angles is None else float(voxels.leaf_angles.tables()[0][-1])
+    for selected, extinction in ((is_bark, 0.25 * bark_density), (is_leaf, projection * leaf_density)):
         _warn_of_closed_surfaces(mesh, selected, extinction, size)
-    if not np.any(is_leaf):
-        return VoxelMap.from_extinction(bark=wood, voxel_size=size, origin=grid.low)
-    angles = _inclinations(mesh.corners[is_leaf]) if leaf_angles is None else leaf_angles
-    return VoxelMap.from_lad(leaf_density, bark=wood, voxel_size=size, origin=grid.low, leaf_angles=angles)
+    return voxels
 
 
 def _warn_of_closed_surfaces(

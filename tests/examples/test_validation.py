@@ -5,6 +5,7 @@ import json
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -15,8 +16,8 @@ SCRIPTS = sorted(
 )
 # Modules in the folders of examples: a name may stand for several files, so imports must not be kept.
 EXAMPLE_MODULES = (
-    *("_airborne", "_common", "_crown", "_recorded", "_validation", "fit_airborne", "fit_gedi"),
-    *("peers", "simulation_cost"),
+    *("_airborne", "_common", "_crown", "_recorded", "_validation", "_waveforms", "fit_airborne"),
+    *("fit_gedi", "peers", "simulation_cost"),
 )
 
 
@@ -131,14 +132,36 @@ def test_open_forests(run, shared):
         assert abs(row["difference"]) < most, row
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(("name", "package"), [("mitransient_crown", "mitransient"), ("mcx_crown", "pmcxcl")])
-def test_other_codes(run, name, package):
+def skip_without(package):
+    """Skip the test if a package is missing."""
     # Not imported: mitransient refuses to be, before its script has chosen a variant of Mitsuba.
     if importlib.util.find_spec(package) is None:
         pytest.skip(f"{package} is not installed")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "package"), [("mitransient_crown", "mitransient"), ("mcx_crown", "pmcxcl")])
+def test_other_codes(run, name, package):
+    skip_without(package)
     record = run(name, "--repeats", "8")
     assert np.sqrt(np.mean(over_error(record) ** 2)) < 2.5
+
+
+@pytest.mark.slow
+def test_meshes_by_mitransient(run):
+    skip_without("mitransient")
+    record = run("mitransient_meshes", "--repeats", "8")
+    assert holds(record)
+    assert {cost["code"] for cost in record["costs"]} == {"jaxlidar", "mitransient"}
+
+    def plant(module):
+        # The renderer's scene keeps its reflectances.
+        surface = module.jl.MeshSurface
+        module.jl = SimpleNamespace(**vars(module.jl))
+        module.jl.MeshSurface = lambda mesh, reflectance: surface(mesh, 1.03 * reflectance)
+
+    wrong = run("mitransient_meshes", "--repeats", "4", planted=plant)
+    assert not holds(wrong, "returned in all")
 
 
 @pytest.mark.slow

@@ -1,12 +1,15 @@
 """Triangle meshes: areas in voxels against closed forms and another implementation, and files of them."""
 
+import re
 import warnings
 
+import jax
 import numpy as np
 import pytest
 
 import jaxlidar as jl
 from jaxlidar.io import read_case, read_obj
+from tests.helpers import SINGLE_SAMPLE, single_sample_lidar
 
 trimesh = pytest.importorskip("trimesh")
 # Spheres and boxes whose area in voxels is known are closed. By its words: naming the class would import the
@@ -258,6 +261,29 @@ def test_closed_surfaces_warn_of_the_light_that_passes_their_voxels():
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         jl.voxelise_mesh(jl.Mesh(box.vertices, box.faces[2:]), 2.0, bark="mesh", leaf=())
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("materials", [{"bark": "mesh", "leaf": ()}, {"leaf": "mesh"}])
+def test_the_share_that_passes_voxels_is_that_of_a_simulation(materials):
+    """The voxels of a house, side by side without end, pass as much light to the ground as the warning says.
+
+    With leaf they do not where its angles are taken as spherical: 14 % in place of 17 %.
+    """
+    corners = [[x, y, z] for x in (0, 4) for y in (0, 4) for z in (0, 2)]
+    house = mesh_of(trimesh.convex.convex_hull([*corners, [0, 2, 3.5], [4, 2, 3.5]]))
+    with pytest.warns(jl.SolidMeshWarning) as messages:
+        voxels = jl.voxelise_mesh(house, 1.0, **materials)
+    stated = re.search(r"let (\d+) % of it pass", str(messages[0].message))
+    assert stated is not None
+    canopy = jl.Canopy(voxels, leaf=jl.LeafOptics(0.4, 0.4), bark=0.4, sides="periodic")
+    scene = jl.Scene(canopy=canopy, ground=jl.Ground(reflectance=0.3))
+    lidar = single_sample_lidar(divergence=0.2, profile="top-hat")
+    wave = jl.simulate(lidar, scene, key=jax.random.key(0), max_orders=1, **SINGLE_SAMPLE)
+    passes = float(wave.components["ground"].sum()) / 0.3
+    # The warning has whole percents.
+    assert 0.01 * int(stated.group(1)) == pytest.approx(passes, abs=0.006)
+    assert 0.1 < passes < 0.5
 
 
 def test_a_tree_as_triangles():

@@ -6,7 +6,6 @@ times do not matter.
 """
 
 import dataclasses
-import warnings
 
 import equinox as eqx
 import jax
@@ -175,54 +174,6 @@ def test_materials_share_one_mesh():
     assert sums["mesh:tile"] == pytest.approx(0.2, abs=1e-3)
     assert sums["mesh:glass"] == pytest.approx(0.05, abs=1e-3)
     assert sums["ground"] == pytest.approx(0.0, abs=1e-6)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("reverse", slow_unless([False], [False, True]))
-def test_derivatives_of_smooth_returns(reverse):
-    """A tilted mesh returns rho cos(tilt), its mean time is -2 h / c; and an OutlineWarning is given."""
-    lidar = jl.Lidar(altitude=ALTITUDE, divergence=1e-3)
-    surface = level(50.0, reflectance=0.4, instances=jl.MeshInstances([[0, 0, 0]], [[30.0, 0, 0]]))
-    options = {"max_orders": 1, "n_rays": 256, "footprint": "fixed", "window": (-40.0, 40.0)}
-    plan = jl.plan(lidar, jl.Scene(meshes=(surface,)), describe=False, **options)
-
-    def measure(tilt, height, shift, reflectance):
-        """Return the energy and the mean time of the return."""
-        turned = eqx.tree_at(
-            lambda s: (s.instances.rotation, s.instances.shift, s.vertices, s.reflectance),
-            surface,
-            (
-                jnp.array([[1.0, 0.0, 0.0]]) * tilt,
-                jnp.array([[0.0, 0.0, 1.0]]) * shift,
-                surface.vertices + jnp.array([[0.0, 0.0, 1.0]]) * height,
-                reflectance,
-            ),
-        )
-        setup = jl.make_setup(lidar, jl.Scene(meshes=(turned,)), plan)
-        wave = jl.waveform_of(jl.trace_scene(setup, jax.random.key(0), reverse=reverse), setup)
-        energy = wave.reflectance.sum()
-        return jnp.stack([energy, (wave.reflectance[0] * wave.time).sum() / energy])
-
-    values = tuple(map(jnp.asarray, (30.0, 0.5, 1.0, 0.4)))
-    with pytest.warns(jl.OutlineWarning, match="outlines and edges of the mesh"):
-        forward = np.array(jax.jacfwd(measure, (0, 1, 2, 3))(*values))
-    cosine, tilt = np.cos(np.deg2rad(30.0)), np.deg2rad(30.0)
-    per_metre = -2.0 / SPEED_OF_LIGHT
-    # The mesh turns about its own origin; a vertex 0.5 m above lies at 0.5 / cos(tilt) along the vertical.
-    expected = np.array(
-        [
-            [-0.4 * np.sin(tilt) * np.pi / 180, per_metre * 0.5 * np.sin(tilt) / cosine**2 * np.pi / 180],
-            [0.0, per_metre / cosine],
-            [0.0, per_metre],
-            [cosine, 0.0],
-        ]
-    )
-    np.testing.assert_allclose(forward, expected, rtol=2e-3, atol=2e-4)
-    if reverse:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", jl.OutlineWarning)
-            backward = np.array(jax.jacrev(measure, (0, 1, 2, 3))(*values))
-        np.testing.assert_allclose(backward, forward, rtol=1e-3, atol=1e-5)
 
 
 @pytest.mark.slow
