@@ -15,6 +15,7 @@ import jax
 import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.figure import Figure
+from PIL import Image
 
 import jaxlidar as jl
 import jaxlidar.plot
@@ -75,6 +76,18 @@ def minnaert() -> Figure:
     return figure
 
 
+def _reduce_colours(path: Path) -> None:
+    """Store a picture with a palette: thousands of points with soft edges do not compress well.
+
+    Colours of few points, such as those of a wire, stay where a palette covers the range of all.
+    """
+    with Image.open(path) as picture:
+        methods, no_dither = Image.Quantize, Image.Dither.NONE
+        reduced = picture.convert("RGB").quantize(48, methods.MAXCOVERAGE, dither=no_dither)
+    with atomic_write(path) as draft:
+        reduced.save(draft, format="png", optimize=True)
+
+
 def main() -> None:
     """Write all pictures."""
     GALLERY.mkdir(exist_ok=True)
@@ -85,6 +98,7 @@ def main() -> None:
         with atomic_write(GALLERY / f"{draw.__name__}.png") as draft:
             draw().savefig(draft, dpi=80, format="png")
     runpy.run_path(str(EXAMPLES / "street.py"))["main"](["--out", str(GALLERY)])
+    _reduce_colours(GALLERY / "street.png")
 
 
 if __name__ == "__main__":
