@@ -258,7 +258,6 @@ def trace_photons(
     3. For each order: compact living photons, and trace chunk after chunk through `_trace_order`.
     4. Tally the weight of photons that still live after the last order.
     """
-    bins, slopes = scene.bins, scene.slopes
     batch = PhotonBatch(scene, words, nodes, node_key)
     empty = vary_with(empty_tally(scene, nodes), scene)
 
@@ -274,13 +273,19 @@ def trace_photons(
         weight = jnp.where(p.alive, p.weight, 0.0)
         remaining = add_to_tally(tally.remaining, (), TallyIndex.of(p), weight)
         tally = eqx.tree_at(lambda t: t.remaining, tally, remaining)
-        return jax.tree.map(jnp.add, total, tally), None
+        return jax.tree.map(jnp.add, total, _without_margins(scene, tally)), None
 
     # Likewise with groups, whose photons are kept for each order.
     step = jax.checkpoint(trace_group) if scene.reverse else trace_group
-    tally, _ = lax.scan(step, empty, jnp.arange(batch.n_groups, dtype=jnp.uint32))
-    if slopes is not None:
-        assert tally.weight_slopes is not None
+    # Without margins the total is the result, and takes no memory of its own.
+    total = _without_margins(scene, empty)
+    return lax.scan(step, total, jnp.arange(batch.n_groups, dtype=jnp.uint32))[0]
+
+
+def _without_margins(scene: DeviceScene, tally: HigherOrderTally) -> HigherOrderTally:
+    """Return a tally of the bins of the record; `outside` has what lies in their margins."""
+    bins = scene.bins
+    if tally.weight_slopes is not None:
         # Derivatives outside the record have no use, unlike the energy there, which `trim` sums up.
         inside = tally.weight_slopes[bins.max_span : bins.max_span + bins.count]
         tally = eqx.tree_at(lambda t: t.weight_slopes, tally, inside)
