@@ -20,6 +20,8 @@ from inversion.fit.unknowns import bind_unknowns
 from jaxlidar.planning import memory
 from jaxlidar.planning.memory import check_memory, format_bytes, memory_limit
 from jaxlidar.spectral.pulse_convolution import pulse_convolution
+from jaxlidar.trace.device_scene import build_device_scene
+from jaxlidar.trace.higher_orders import trace_higher_orders
 from tests.helpers import slab, slow_unless, with_applied_optics
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -37,6 +39,20 @@ def test_many_plates_are_refused_before_anything_is_allocated():
     lidar = jl.Lidar(wavelength=np.linspace(500.0, 1600.0, memory.MAX_APPLIED_WAVELENGTHS + 1))
     with pytest.raises(ValueError, match=r"would take about .* GB of memory; .* at most 8 wavelengths"):
         jl.plan(lidar, scene, max_orders=12, describe=False)
+
+
+@pytest.mark.slow
+def test_the_sum_of_photons_is_the_result():
+    """Beside the result there is one tally, that of a group of photons, with margins."""
+    canopy = jl.Canopy(slab(1.0), leaf=jl.LeafOptics(0.4, 0.4), hotspot=False)
+    scene, lidar = jl.Scene(canopy=canopy, plates=plates(1), ground=GROUND), jl.Lidar()
+    plan = jl.plan(lidar, scene, n_photons=16384, max_orders=8, histories=True, describe=False)
+    device_scene = build_device_scene(jl.make_setup(lidar, scene, plan), derivatives="none")
+    compiled = jax.jit(lambda key: trace_higher_orders(device_scene, key)).lower(KEY).compile()
+    sizes = compiled.memory_analysis()
+    assert sizes is not None
+    assert sizes.output_size_in_bytes > 4e6
+    assert sizes.temp_size_in_bytes < 1.5 * sizes.output_size_in_bytes
 
 
 TWO_WAVELENGTHS = jl.Lidar(wavelength=(532.0, 1064.0))
