@@ -129,10 +129,12 @@ def plan_for_bounds(
         except ValueError as error:
             raise ValueError(f"at the bounds of the unknowns the scene is inadmissible: {error}") from error
 
-    first = make_plan(shots, scene, max_orders=sizes.max_orders, **common)
+    start_lidar, start_scene = cases[0]
+    start_shots = start_lidar if survey is None else survey
+    first = make_plan(start_shots, start_scene, max_orders=sizes.max_orders, **common)
     # Fits of surveys trace all derivatives, and many shots at once.
     if survey is None and not first.config.keeps_histories:
-        first = _plan_with_histories(first, lidar, scene, max_orders=sizes.max_orders, **common)
+        first = _plan_with_histories(first, start_lidar, start_scene, max_orders=sizes.max_orders, **common)
     width = first.bins.width
     if any(u.setter.of_lidar for u in unknowns):
         width = min(width, *(plan_corner(case, **common).bins.width for case in cases[1:]))

@@ -60,8 +60,7 @@ def _as_optional_start(x: ArrayLike | None) -> Float[Array, "..."] | None:
 
 @final
 class Unknown(eqx.Module):
-    """An unknown of a retrieval: an array of the scene or of the lidar, or a value that a function puts into
-    the scene.
+    """An unknown of a retrieval: an array of the scene or the lidar, or a value that changes several arrays.
 
     A start on a bound, or closer to it than 1 % of the bounds' width, is moved to that distance.
 

@@ -374,8 +374,7 @@ def _pulses_by_time(time: np.ndarray) -> np.ndarray:
     """Return numbers of the laser pulses of photons in a file without the product's frames."""
     finite_time = time[np.isfinite(time)]
     first = float(finite_time.min()) if finite_time.size else 0.0
-    with np.errstate(over="ignore", invalid="ignore"):
-        return _whole_numbers(np.rint((time - first) * PULSE_RATE))
+    return _whole_numbers(np.rint((time - first) * PULSE_RATE))
 
 
 def _background_rate(file: ProductFile, beam: str, time: np.ndarray) -> np.ndarray:

@@ -94,8 +94,8 @@ class NetcdfFile:
                 superblock = beginning.read(_SUPERBLOCK)
             if not superblock.startswith(_HDF5_SIGNATURE):
                 raise ValueError(f"{path}: byte 0: no netCDF-4 file")
-            # Names and texts lie in heaps (`jaxlidar.io.hdf5`). Before version 2, two bytes stand before the
-            # sizes of offsets and lengths that are no part of the later ones.
+            # Names and texts lie in heaps (`jaxlidar.io.hdf5`). Up to version 1, four bytes stand before the
+            # sizes of offsets and lengths that later superblocks do not have.
             is_old = superblock[8:9] < b"\2"
             size_of_lengths = superblock[14 if is_old else 10] if len(superblock) == _SUPERBLOCK else 0
             stream = stack.enter_context(CheckedHeapStream(path, size_of_lengths))
