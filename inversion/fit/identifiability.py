@@ -162,14 +162,21 @@ def cramer_rao(
     bound_unknowns = bind_unknowns(unknowns, scene, lidar)
     priors = fixed_priors(bound_unknowns)
     sample_times = None if time is None else as_sample_times(time, lidar)
-    # Derivatives are needed at the scene only: without sample times, its own plan serves.
-    if plan is not None:
-        check_reach(plan, lidar, scene)
-    elif sample_times is not None:
-        plan = plan_for_bounds(lidar, scene, bound_unknowns, sample_times, sizes)
-    else:
+    moves_lidar = any(u.setter.of_lidar for u in bound_unknowns)
+    if plan is None and sample_times is None:
+        # Derivatives are needed at the scene only: without sample times, its own plan serves.
         photons, rays, _ = sizes
         plan = make_plan(lidar, scene, max_orders=max_orders, n_photons=photons, n_rays=rays)
+        if moves_lidar:
+            # A plan for a beam at nadir knows no other direction, and none of its derivatives.
+            plan = plan_for_bounds(lidar, scene, bound_unknowns, _sample_times(plan), sizes)
+    elif plan is None:
+        assert sample_times is not None
+        plan = plan_for_bounds(lidar, scene, bound_unknowns, sample_times, sizes)
+    elif moves_lidar:
+        plan = checked_plan(plan, lidar, scene, bound_unknowns, _sample_times(plan), sizes)
+    else:
+        check_reach(plan, lidar, scene)
     if sample_times is not None:
         check_samples(plan, sample_times)
     sigma = as_noise(noise, (lidar.wavelength.size, plan.n_samples))
@@ -372,6 +379,11 @@ def profile_likelihood(
         others={k: np.stack([estimates[i][k] for i in range(points.size)]) for k in estimates[middle]},
         converged=np.array([fit.summary.converged for fit in ordered]),
     )
+
+
+def _sample_times(plan: Plan) -> Float[np.ndarray, " samples"]:
+    """Return the times of the samples of a plan, ns."""
+    return plan.sample_start + plan.sample_interval * np.arange(plan.n_samples)
 
 
 def _fixed_unknown(name: str, unknowns: Sequence[BoundUnknown]) -> BoundUnknown:

@@ -63,13 +63,14 @@ def jacobian():
 @pytest.mark.parametrize("path", STEPS)
 def test_columns_agree_with_differences(jacobian, path):
     columns, reflectance = jacobian
-    first = ["lidar.position", "lidar.position[1]", *list(STEPS)[1:]].index(path)
+    # The position has two columns.
+    number = ["lidar.position", "lidar.position[1]", *list(STEPS)[1:]].index(path)
     step, _ = STEPS[path]
     value = jnp.asarray(array_of(LIDAR, path), float)
     direction = step * jnp.eye(max(value.size, 1))[0].reshape(value.shape)
     lidars = [eqx.tree_at(lambda a: array_of(a, path), LIDAR, value + sign * direction) for sign in (1, -1)]
     ends = [np.asarray(reflectance(lidar), float) for lidar in lidars]
-    difference, column = (ends[0] - ends[1]) / (2 * step), columns[:, first]
+    difference, column = (ends[0] - ends[1]) / (2 * step), columns[:, number]
     norm = np.linalg.norm(difference)
     assert norm > 0
     assert np.linalg.norm(column - difference) < 0.02 * norm
@@ -98,6 +99,51 @@ def test_the_place_of_a_footprint_and_its_pulse_are_found():
         assert error < 0.1
     # The start lies many standard errors away.
     assert 10 * fit.stderr["position"][0] < 1.5
+
+
+def test_a_slope_tells_how_far_up_it_a_footprint_lies():
+    """The mean time of the return does, with the slope; along the contour nothing changes."""
+    options: Any = {"noise": 1e-3, "key": jax.random.key(0), **FIRST_ORDER}
+    position = Unknown("lidar.position", bounds=(-5.0, 5.0))
+    bound = inversion.cramer_rao(LIDAR, SCENE, [position], **options)
+    error = bound.stderr["lidar.position"]
+    assert error[0] < 0.1
+    assert not error[1] < 100 * error[0]
+
+
+def test_a_bound_at_nadir_is_that_of_a_beam_beside_it():
+    """A start on a bound moves by 1 % of the width, to 0.09 degrees. A plan for nadir does not serve it."""
+    nadir = dataclasses.replace(LIDAR, zenith=0.0, azimuth=90.0)
+    options: Any = {"noise": 1e-3, "key": jax.random.key(0), **FIRST_ORDER}
+    zenith = Unknown("lidar.zenith", bounds=(0.0, 9.0))
+    errors = [
+        float(inversion.cramer_rao(lidar, SCENE, [zenith], **options).stderr["lidar.zenith"])
+        for lidar in (nadir, dataclasses.replace(nadir, zenith=0.09))
+    ]
+    assert np.isfinite(errors[0])
+    assert errors[0] == pytest.approx(errors[1], rel=0.01)
+    plan = jl.plan(nadir, SCENE, max_orders=1, describe=False)
+    with pytest.raises(ValueError, match="the plan does not fit: it is for a beam at nadir"):
+        inversion.cramer_rao(nadir, SCENE, [zenith], noise=1e-3, key=jax.random.key(0), plan=plan)
+
+
+def test_posterior_and_profile_know_the_lidar():
+    """The gradient of a log-density is its difference, and a profile's minimum is at the truth."""
+    truth = dataclasses.replace(LIDAR, pulse=jl.GaussianPulse(4.0))
+    wave = waveform_of(truth)
+    unknowns = [
+        Unknown("lidar.pulse.fwhm", bounds=(3.0, 8.0), name="fwhm"),
+        Unknown("ground.reflectance", bounds=(0.1, 0.6), name="reflectance"),
+    ]
+    options = {"noise": 0.01 * float(wave.reflectance.max()), "key": jax.random.key(2), **FIRST_ORDER}
+    density = inversion.log_density(wave, LIDAR, SCENE, unknowns, **options)
+    gradient = np.asarray(jax.grad(density)(density.initial))
+    step = 0.02 * np.eye(2)
+    differences = [float(density(density.initial + h) - density(density.initial - h)) / 0.04 for h in step]
+    np.testing.assert_allclose(gradient, differences, rtol=0.02)
+    profile = inversion.profile_likelihood(wave, LIDAR, SCENE, unknowns, "fwhm", [3.8, 4.0, 4.2], **options)
+    assert int(np.argmin(profile.chi2)) == 1
+    assert min(profile.chi2[0], profile.chi2[2]) > 10.0
 
 
 @pytest.mark.slow
