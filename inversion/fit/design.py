@@ -51,7 +51,8 @@ from inversion.fit.unknowns import (
 from jaxlidar import Lidar, Plan, Response, Scene, plan_scenes, total_reflectance, trace_scene
 from jaxlidar.extend import as_numpy, check_integer, check_key, check_kind, check_kinds, check_range
 
-# Fields of a lidar that act after the trace.
+# Fields of a lidar that act after the trace, of which `inversion.fit.unknowns` names those that records
+# determine.
 _ADMISSIBLE_FIELDS = ("wavelength", "pulse", "energy", "efficiency", "jitter")
 # Bounds of wavelengths, nm: those of the leaf models. Of other values: this factor about those of the lidar.
 _WAVELENGTHS, _DEFAULT_FACTOR = (400.0, 2500.0), 4.0

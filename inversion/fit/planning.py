@@ -180,12 +180,12 @@ def checked_plan(
         check_samples(plan, time)
         return plan
     check_samples(plan, time)
-    pulse_changes = any(u.setter.of_lidar for u in unknowns)
+    moves_lidar = any(u.setter.of_lidar for u in unknowns)
     # The first case is the start itself.
     for number, corner in enumerate(corner_cases(lidar, scene, unknowns)):
         try:
             check_reach(plan, *corner)
-            if pulse_changes:
+            if moves_lidar:
                 check_pulse(plan, *corner)
         except ValueError as error:
             position = "at the bounds of the unknowns " if number else ""

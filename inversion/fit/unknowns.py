@@ -30,6 +30,7 @@ MARGIN = 0.01
 # Beginning of a path in the lidar.
 _OF_LIDAR = "lidar."
 # Fields of a lidar whose arrays can be unknown: those that act after the trace, and those that move rays.
+# Energy and efficiency do not change the apparent reflectance.
 _LATE_FIELDS = ("pulse", "jitter")
 _RAY_FIELDS = ("position", "altitude", "zenith", "azimuth", "divergence", "field_of_view")
 
