@@ -68,7 +68,7 @@ def _add(a: Any, b: Any) -> Any:
 
 def _mean_waveform(total: Response, batches: Array, model: WaveformModel) -> Waveform:
     """Make the waveform of the mean of so many responses."""
-    return waveform_of_model(jax.tree.map(lambda a: a / batches, total), model)
+    return waveform_of_model(total, model.for_sum_of(batches))
 
 
 def _with_batch_number(trace: Callable) -> Callable:

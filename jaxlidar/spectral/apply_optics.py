@@ -60,6 +60,7 @@ class WaveformModel(eqx.Module):
     - `one_order`: True if one order is followed. `can_scatter_again`: True if scattered light can meet the
       scene.
     - `pivots`: wavelengths at which histories are summed, and interpolated to all; None: at all.
+    - `batches`: the response is the sum of so many; samples are those of their mean. None: it is one.
     """
 
     optics: Float[Array, "channels wavelengths"]
@@ -78,6 +79,7 @@ class WaveformModel(eqx.Module):
     one_order: bool = eqx.field(static=True)
     can_scatter_again: bool = eqx.field(static=True)
     pivots: PivotWavelengths | None = None
+    batches: Float[Array, ""] | None = None
 
     @property
     def first_histories(self) -> Histories:
@@ -108,6 +110,10 @@ class WaveformModel(eqx.Module):
         """Return the model of responses to which optics have been applied while light was traced."""
         return dataclasses.replace(self, first_degree=0, degree=0)
 
+    def for_sum_of(self, batches: Float[Array, ""]) -> "WaveformModel":
+        """Return the model of the sum of the responses of so many batches."""
+        return dataclasses.replace(self, batches=batches)
+
     @property
     def sample_pivots(self) -> PivotWavelengths | None:
         """Pivots from which samples follow; None under an atmosphere, which is no such polynomial."""
@@ -123,7 +129,9 @@ class WaveformModel(eqx.Module):
     ) -> Float[Array, "*rest rows columns"]:
         """Sum weights with their optics over histories, in rows of wavelengths or of pivots."""
         optics = self.optics if self.pivots is None else self.optics[:, self.pivots.indices]
-        return apply_optics(weights, table, optics)
+        sums = apply_optics(weights, table, optics)
+        # Divided here and not before: a mean response would be a second array of the size of the sum.
+        return sums if self.batches is None else sums / self.batches
 
     def interpolate(
         self, sums: Float[Array, "*rest rows columns"]

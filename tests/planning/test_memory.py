@@ -9,6 +9,7 @@ from pathlib import Path
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -19,7 +20,9 @@ from inversion.fit.planning import plan_for_bounds, trace_sizes
 from inversion.fit.unknowns import bind_unknowns
 from jaxlidar.planning import memory
 from jaxlidar.planning.memory import check_memory, format_bytes, memory_limit
+from jaxlidar.sampling.batch_programs import make_batch_tracer
 from jaxlidar.spectral.pulse_convolution import pulse_convolution
+from jaxlidar.spectral.waveform import waveform_of_model
 from jaxlidar.trace.device_scene import build_device_scene
 from jaxlidar.trace.higher_orders import trace_higher_orders
 from tests.helpers import slab, slow_unless, with_applied_optics
@@ -53,6 +56,35 @@ def test_the_sum_of_photons_is_the_result():
     assert sizes is not None
     assert sizes.output_size_in_bytes > 4e6
     assert sizes.temp_size_in_bytes < 1.5 * sizes.output_size_in_bytes
+
+
+@pytest.mark.slow
+def test_the_waveform_of_a_sum_needs_no_second_response():
+    """The mean over batches is taken after the sum over histories: a mean response would be as large."""
+    canopy = jl.Canopy(slab(1.0), leaf=jl.LeafOptics(0.4, 0.4), bark=0.4, hotspot=False)
+    scene, lidar = jl.Scene(canopy=canopy, plates=plates(1), ground=GROUND), jl.Lidar()
+    plan = jl.plan(lidar, scene, n_photons=16384, max_orders=8, histories=True, describe=False)
+    tracer = make_batch_tracer(jl.make_setup(lidar, scene, plan), KEY)
+    response, _ = tracer.batch_function(KEY)(0)
+    size = sum(array.nbytes for array in jax.tree.leaves(response))
+    assert size > 4e6
+
+    def temporaries(make_waveform):
+        program = jax.jit(lambda total: make_waveform(total, tracer.model)).lower(response).compile()
+        sizes = program.memory_analysis()
+        assert sizes is not None
+        return sizes.temp_size_in_bytes
+
+    def of_mean(total, model):
+        return waveform_of_model(jax.tree.map(lambda a: a / 8.0, total), model)
+
+    def of_sum(total, model):
+        return waveform_of_model(total, model.for_sum_of(jnp.asarray(8.0)))
+
+    assert temporaries(of_sum) < temporaries(of_mean) - 0.9 * size
+    np.testing.assert_allclose(
+        of_sum(response, tracer.model).reflectance, of_mean(response, tracer.model).reflectance, rtol=1e-5
+    )
 
 
 TWO_WAVELENGTHS = jl.Lidar(wavelength=(532.0, 1064.0))
