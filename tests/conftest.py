@@ -1,6 +1,8 @@
 """Set-up of all tests: rank promotion is refused; shapes and types of the packages are checked."""
 
+import importlib.util
 import itertools
+import pkgutil
 from pathlib import Path
 
 import equinox as eqx
@@ -19,7 +21,20 @@ jax.config.update("jax_numpy_rank_promotion", "raise")
 # beartype refuses an int for a float unless told of the numeric tower of PEP 484.
 CHECKER = "beartype.beartype(conf=beartype.BeartypeConf(is_pep484_tower=True))"
 
-with install_import_hook(["jaxlidar", "inversion"], CHECKER):
+# Called a million times by the tests of trees alone, and they raise errors of their own.
+UNHOOKED = {"jaxlidar._checks", "jaxlidar._signatures"}
+
+
+def hooked_modules():
+    """Return the names of the modules and subpackages whose shapes and types are checked."""
+    names = []
+    for package in ("jaxlidar", "inversion"):
+        folders = importlib.util.find_spec(package).submodule_search_locations
+        names += [module.name for module in pkgutil.iter_modules(folders, f"{package}.")]
+    return [name for name in names if name not in UNHOOKED]
+
+
+with install_import_hook(hooked_modules(), CHECKER):
     import jaxlidar  # noqa: F401
 
     # Before `inversion` is imported, as in the processes that tests start: options are read there by then.
