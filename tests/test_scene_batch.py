@@ -8,6 +8,7 @@ import pytest
 
 import jaxlidar as jl
 from jaxlidar.planning.plan_check import check_plan
+from tests.helpers import slow_unless
 
 KEY = jax.random.key(3)
 LIDAR = jl.Lidar(altitude=4e5, divergence=0.0625, aperture=0.8, pulse=jl.GaussianPulse(15.6))
@@ -58,6 +59,7 @@ def test_each_waveform_is_that_of_its_scene_alone(waves, plan_of_two_orders):
     assert np.max(np.abs(waves[4].reflectance - other.reflectance)) > 1e-5
 
 
+@pytest.mark.slow
 def test_standard_errors_are_those_of_each_scene(waves, plan_of_two_orders):
     repeated = jl.simulate_scenes(
         LIDAR, random_stands(), plan=plan_of_two_orders, key=jax.random.key(4), chunk=3
@@ -67,10 +69,16 @@ def test_standard_errors_are_those_of_each_scene(waves, plan_of_two_orders):
     assert 0.5 < np.sqrt(np.mean(np.square(np.asarray(z)[bright]))) < 1.3
 
 
-def test_chunks_and_other_scenes_change_nothing(waves, plan_of_two_orders):
+@pytest.mark.parametrize("orders", slow_unless([1], [1, 2]))
+def test_chunks_and_other_scenes_change_nothing(orders):
+    plan = jl.plan_scenes(LIDAR, random_stands(), max_orders=orders, n_photons=64, n_rays=8)
     fewer = jax.tree.map(lambda a: a[:5], random_stands())
-    repeated = jl.simulate_scenes(LIDAR, fewer, plan=plan_of_two_orders, key=KEY, chunk=3)
+    waves, repeated = (
+        jl.simulate_scenes(LIDAR, scenes, plan=plan, key=KEY, chunk=3) for scenes in (random_stands(), fewer)
+    )
     np.testing.assert_allclose(repeated.reflectance, waves.reflectance[:5], rtol=1e-4, atol=1e-9)
+    # The same test rejects the neighbours' waveforms.
+    assert not np.allclose(repeated.reflectance, waves.reflectance[1:6], rtol=1e-4, atol=1e-9)
 
 
 def test_the_plan_of_a_stack_serves_all_of_its_scenes():

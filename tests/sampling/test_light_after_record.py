@@ -33,15 +33,13 @@ def late(wave):
 
 def test_a_window_of_the_plan_warns_and_one_of_the_user_does_not():
     with pytest.warns(LateLightWarning, match=r"% of the light is still on its way .* give window="):
-        wave = jl.simulate(LIDAR, BRIGHT, key=KEY, n_photons=20_000, max_orders=4)
+        wave = jl.simulate(LIDAR, BRIGHT, key=KEY, n_photons=2_000, max_orders=4)
     assert late(wave) > 0.01
     assert "of the light is still on its way when the record ends" in str(wave)
     end = float(wave.time[-1])
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        user_window = jl.simulate(
-            LIDAR, BRIGHT, key=KEY, n_photons=20_000, max_orders=4, window=(-600.0, end)
-        )
+        user_window = jl.simulate(LIDAR, BRIGHT, key=KEY, n_photons=2_000, max_orders=4, window=(-600.0, end))
     assert late(user_window) > 0.01
     assert "of the light is still on its way when the record ends" in str(user_window)
 

@@ -114,7 +114,10 @@ def oblique_and_limited(count):
     return oblique(count, field_of_view=0.4)
 
 
-@pytest.mark.parametrize("shots", [6, pytest.param(50, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    ("shots", "orders"),
+    [(6, 1), pytest.param(6, 2, marks=pytest.mark.slow), pytest.param(50, 2, marks=pytest.mark.slow)],
+)
 @pytest.mark.parametrize(
     ("kind", "shared"),
     [
@@ -127,8 +130,8 @@ def oblique_and_limited(count):
         pytest.param(scan, False, marks=pytest.mark.slow),
     ],
 )
-def test_shots_agree_with_single_simulations(kind, shared, shots):
-    survey, scene, options = kind(shots), stand(), {"rtol": 0.03, "max_orders": 2}
+def test_shots_agree_with_single_simulations(kind, shared, shots, orders):
+    survey, scene, options = kind(shots), stand(), {"rtol": 0.03, "max_orders": orders}
     waves = simulate_each(survey, scene, **options)
     options |= {"shared": shared}
     waveforms = jl.simulate_many(survey, scene, key=KEY, **options)
@@ -198,6 +201,7 @@ def test_shots_end_for_the_reasons_of_single_simulations():
     assert stopped() == "orders beyond 2 may add 100 %"
 
 
+@pytest.mark.slow
 def test_large_coordinates_lose_no_precision():
     survey, scene = nadir(16), stand()
     waveforms = jl.simulate_many(survey, scene, key=KEY, **FAST)

@@ -87,7 +87,7 @@ def test_a_fit_ends_where_one_with_all_batches_does(monkeypatch):
     # Both with the weights of the solution; those of the start put the simulation's noise elsewhere.
     monkeypatch.setattr("inversion.fit.solver._MAX_WEIGHT_CHANGE", 0.0)
     distances_of_pilot_fits, n_traced = [], []
-    for seed in range(12):
+    for seed in range(8):
         with_pilot, with_all = BatchedSimulation(PILOT_BATCHES, seed), BatchedSimulation(MIN_BATCHES, seed)
         (a, details), (b, details_all) = fit_echoes(with_pilot, seed), fit_echoes(with_all, seed)
         assert a.converged
