@@ -313,6 +313,7 @@ print(json.dumps(positions))
 """
 
 
+@pytest.mark.slow
 def test_help_begins_with_the_summary_of_a_class():
     """It follows name and arguments within ten lines; for classes that users construct, even sooner."""
     process = subprocess.run(

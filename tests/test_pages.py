@@ -32,7 +32,7 @@ def blocks(path, language):
 # Those that take longer than the front page's first ones; its last one simulates a hectare.
 LONG = {
     "README.md": {3},
-    "jaxlidar/README.md": {0, 1, 2, 5, 8, 9},
+    "jaxlidar/README.md": {0, 1, 2, 3, 5, 8, 9},
     "inversion/README.md": {2, 3},
 }
 EXAMPLES = [
@@ -61,7 +61,11 @@ def test_long_examples_are_examples():
 NUMBER = r"-?\d+(?:\.\d+)?(?:e[-+]\d+)?"
 
 
-@pytest.mark.parametrize("path", PAGES, ids=page_name)
+@pytest.mark.parametrize(
+    "path",
+    [pytest.param(p, marks=pytest.mark.slow if page_name(p) == "jaxlidar/README.md" else ()) for p in PAGES],
+    ids=page_name,
+)
 def test_printed_output_is_that_of_the_example_above_it(path, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     pairs = r"^```python\n((?:(?!^```).)*)^```\n\n```text\n(.*?)^```"

@@ -77,6 +77,7 @@ def test_info_of_recorded_waveforms(tmp_path, capsys):
         assert re.match(description, out), out
 
 
+@pytest.mark.slow
 def test_airborne_waveforms_become_packets(shared, tmp_path, capsys):
     source, target = shared / "airborne" / "lvis_example2.pls", tmp_path / "b.las"
     assert cli.main(["convert", str(source), str(target)]) == 0

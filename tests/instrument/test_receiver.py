@@ -200,6 +200,7 @@ def fine_record():
     return time, np.stack([echo(3.3) + 2 * echo(14.1), 0.5 * echo(14.1)])
 
 
+@BY_PRECISION
 @pytest.mark.parametrize("interval", [0.1, 1.0, 2.5, 0.73, 0.03, 100.0])
 def test_first_return_window_conserves_energy_and_opens_at_the_first_return(interval, precision):
     time, energy = fine_record()

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from jaxlidar import _expint
+from tests.helpers import BY_PRECISION
 
 EXACT = {
     "e1": mpmath.e1,
@@ -54,6 +55,7 @@ def test_values_and_derivatives(name, precision):
         assert np.all(relative_error(slopes, [SLOPE[name](x) for x in points]) < tolerance)
 
 
+@BY_PRECISION
 @pytest.mark.parametrize("name", EXACT)
 def test_zero_and_large_arguments(name, precision):
     function = getattr(_expint, name)

@@ -117,6 +117,7 @@ def values_and_slopes(k, N, face):
 TOLERANCE = {"float32": 1e-6, "float64": 1e-13}
 
 
+@BY_PRECISION
 def test_against_the_textbook_in_150_digits(precision):
     points = grid_points(precision)
     k, N = (jnp.array([p[i] for p in points]) for i in (0, 1))
@@ -159,6 +160,7 @@ def test_slopes_are_the_derivatives(precision):
     )
 
 
+@pytest.mark.slow
 @BY_PRECISION
 def test_reverse_equals_forward(precision):
     unit = float(np.finfo(precision).eps)

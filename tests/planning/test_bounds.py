@@ -128,13 +128,9 @@ CASES = {
 # The other cases repeat these effects in larger scenes.
 FAST_CASES = (
     "slope spread",
-    "divergence",
     "field of view",
-    "jitter",
     "extinction",
-    "backscatter",
     "plates",
-    "mirror",
 )
 
 

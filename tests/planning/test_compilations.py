@@ -126,6 +126,7 @@ def test_size_buckets(steps):
     assert len(np.unique(buckets)) <= 12 * steps + 2
 
 
+@pytest.mark.slow
 def test_keys_can_be_mapped_over():
     """Under a transformation the sizes are those of the plan, also with a concrete scene."""
     scene = jl.Scene(plates=(jl.Plate(5.0, 0.3, 0.3),), ground=jl.Ground())

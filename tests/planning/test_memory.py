@@ -195,6 +195,7 @@ def test_sizes_in_words():
     assert memory.machine_memory() > 1e8
 
 
+@pytest.mark.slow
 def test_a_grazing_beam_over_a_slope_takes_no_matrix():
     """At 85 degrees the footprint is long: 19 GB as a matrix."""
     lidar = jl.Lidar(zenith=85.0, divergence=3.0)

@@ -225,9 +225,9 @@ def test_the_lowest_altitude_is_named_where_a_scene_reaches_up_to_the_sensor(zen
     ("pulse", "jitter", "rays"),
     [
         (jl.GaussianPulse(0.0), 0.0, 2048),
-        (jl.GaussianPulse(2.0), 0.0, 2048),
+        pytest.param(jl.GaussianPulse(2.0), 0.0, 2048, marks=pytest.mark.slow),
         (jl.GaussianPulse(2.0), 1.0, 1024),
-        (jl.GaussianPulse(6.0), 0.0, 1024),
+        pytest.param(jl.GaussianPulse(6.0), 0.0, 1024, marks=pytest.mark.slow),
         # The power of a rectangular pulse jumps: its finest feature is 0.
         (jl.RectangularPulse(2.0), 0.0, 2048),
         (jl.RectangularPulse(6.0), 0.0, 1024),

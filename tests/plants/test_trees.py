@@ -7,6 +7,7 @@ import pytest
 from scipy import stats
 
 import jaxlidar as jl
+from tests.helpers import slow_unless
 
 HABITS = {"broadleaf": jl.broadleaf, "conifer": jl.conifer, "spreading": jl.spreading_tree, "shrub": jl.shrub}
 SEEDS = (0, 1, 2, 11)
@@ -26,7 +27,7 @@ def excess_at_nodes(tree, exponent=2.0):
     return sum_of_children[is_node] / tree.radius_end[is_node] ** exponent - 1
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", slow_unless(range(2), range(6)))
 def test_the_default_is_table_2(seed):
     tree = jl.grow(seed=seed)
     assert tree.height == pytest.approx(15.0, rel=0.01)

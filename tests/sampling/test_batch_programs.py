@@ -28,13 +28,14 @@ def same(plan):
     return plan
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("orders", "transmission", "change"),
     [
         (1, "diffuse", same),
-        pytest.param(2, "diffuse", same, marks=pytest.mark.slow),
-        pytest.param(2, "straight", same, marks=pytest.mark.slow),
-        pytest.param(2, "diffuse", with_applied_optics, marks=pytest.mark.slow),
+        (2, "diffuse", same),
+        (2, "straight", same),
+        (2, "diffuse", with_applied_optics),
     ],
     ids=["one order", "two orders", "straight", "optics applied"],
 )

@@ -21,7 +21,7 @@ import pytest
 import jaxlidar as jl
 from jaxlidar.extend import vec
 from jaxlidar.scenes.height_field import HeightField
-from tests.helpers import SINGLE_SAMPLE, agrees, batch_mean, single_sample_lidar
+from tests.helpers import SINGLE_SAMPLE, agrees, batch_mean, single_sample_lidar, slow_unless
 
 KEY = jax.random.key(3)
 X, Y = np.meshgrid(np.arange(21.0), np.arange(17.0), indexing="ij")
@@ -391,7 +391,7 @@ def test_a_ridge_hides_its_far_slope():
 # -- limits of numbers -------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("azimuth", [0.0, 37.0])
+@pytest.mark.parametrize("azimuth", slow_unless([37.0], [0.0, 37.0]))
 def test_every_grazing_ray_meets_terrain_that_repeats(azimuth):
     """A spike of 20 m on nodes of 5 mm: a ray crosses a hundred thousand cells while it falls by 20 m.
 
@@ -413,7 +413,7 @@ def test_every_grazing_ray_meets_terrain_that_repeats(azimuth):
 
 
 @pytest.mark.parametrize("zenith", [0.0, 30.0])
-@pytest.mark.parametrize("height", [-4e4, 4e4, -3e5])
+@pytest.mark.parametrize("height", slow_unless([4e4, -3e5], [-4e4, 4e4, -3e5]))
 @pytest.mark.parametrize("kind", ["plane", "terrain", "plate"])
 def test_surfaces_far_from_the_reference_plane(kind, height, zenith):
     """They return rho cos(zenith): rays start above them, by more than single precision rounds."""

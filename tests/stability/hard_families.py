@@ -242,7 +242,7 @@ def one_voxel_family(edge, interval):
         settings = {"max_orders": 1, "n_rays": 1, "footprint": "fixed", "bin_width": 2e-3 * interval}
         return simulation(build, ONE_VOXEL, sample_sum, window=window, **settings)
 
-    return Family(ONE_VOXEL, make, answers.one_voxel, (1e-5, 1e-9), (1e-4, 1e-9), DOUBLE_PRECISION)
+    return Family(ONE_VOXEL, make, answers.one_voxel, (1e-5, 1e-9), (1e-4, 1e-9), BOTH_PRECISIONS)
 
 
 # -- all orders --------------------------------------------------------------------------------------------
@@ -427,13 +427,13 @@ def measure_pulses():
 def chord_family(periodic):
     make = functools.partial(measure_chord, periodic)
     answer = functools.partial(answers.chord, shape=CHORD_SHAPE, periodic=periodic)
-    return Family(CHORD, make, answer, (2e-6, 1e-13), (2e-6, 1e-13))
+    return Family(CHORD, make, answer, (2e-6, 1e-13), (2e-6, 1e-13), DOUBLE_PRECISION)
 
 
 FAMILIES = {
     # Derivatives with respect to time have an error of second order in the fine bin of 0.5 ns.
-    "ground": ground_family(1.0, 60.0, (2e-4, 2e-4), (1e-2, 1e-2)),
-    "ground, 0.1 ns": ground_family(0.1, 12.0, (1e-4, 1e-5), (1e-3, 1e-4), DOUBLE_PRECISION),
+    "ground": ground_family(1.0, 60.0, (2e-4, 2e-4), (1e-2, 1e-2), DOUBLE_PRECISION),
+    "ground, 0.1 ns": ground_family(0.1, 12.0, (1e-4, 1e-5), (1e-3, 1e-4), BOTH_PRECISIONS),
     "short pulse": Family(
         SHORT_PULSE,
         measure_short_pulse,
@@ -487,5 +487,6 @@ FAMILIES = {
         lambda n: answers.pulses(n, [answers.mpf(t) for t in PULSE_TIMES]),
         (1e-6, 1e-13),
         (1e-6, 1e-13),
+        DOUBLE_PRECISION,
     ),
 }

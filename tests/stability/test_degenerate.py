@@ -146,6 +146,7 @@ def ground_plans():
     return {name: jl.plan(lidar, scene, window=(-20.0, 20.0)) for name, scene in scenes.items()}
 
 
+@BY_PRECISION
 def test_a_scene_with_nothing_in_it(precision):
     lidar = jl.Lidar()
     wave = jl.simulate(lidar, jl.Scene(), key=jax.random.key(0))

@@ -56,7 +56,7 @@ SCENES = {
 @pytest.mark.parametrize(
     ("name", "derivatives", "histories"),
     [
-        ("canopy", False, False),
+        pytest.param("canopy", False, False, marks=pytest.mark.slow),
         ("canopy", True, True),
         ("plate", False, True),
         pytest.param("plate", False, False, marks=pytest.mark.slow),

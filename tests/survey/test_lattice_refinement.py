@@ -34,6 +34,7 @@ def shots(count: int = 8) -> jl.Survey:
     return jl.Survey(LIDAR, np.stack([10.0 + np.linspace(-1.6, 1.6, count), np.full(count, 10.0)], axis=1))
 
 
+@BY_PRECISION
 def test_slices_of_a_lattice_make_up_that_lattice(precision):
     beam, shift = make_beam(LIDAR), jnp.asarray([0.3, 0.8])
     (x, y), energy = fibonacci_disc(beam, 24 * 5, shift)

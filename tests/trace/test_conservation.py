@@ -46,7 +46,8 @@ CASES = {
 }
 
 
-@pytest.mark.parametrize("name", slow_unless(["periodic, off nadir"], CASES))
+@pytest.mark.slow
+@pytest.mark.parametrize("name", CASES)
 def test_the_energy_budget_sums_to_one(name):
     case_scene, zenith = CASES[name]
     lidar = jl.Lidar(wavelength=(532.0, 1064.0), zenith=zenith, divergence=2.0)
@@ -60,7 +61,7 @@ def test_the_energy_budget_sums_to_one(name):
         assert float(wave.energy_budget["unfollowed"][0]) > 0.1
 
 
-@pytest.mark.parametrize("name", ["absorbing", "plate"])
+@pytest.mark.parametrize("name", slow_unless(["plate"], ["absorbing", "plate"]))
 def test_the_energy_budget_of_one_order_sums_to_one(name):
     case_scene, _ = CASES[name]
     wave = jl.simulate(

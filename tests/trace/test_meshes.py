@@ -46,7 +46,7 @@ def first_sums(lidar, scene, n_rays=8192, **options):
     return {name: float(a.sum()) for name, a in wave.components.items()}
 
 
-@pytest.mark.parametrize("surface", ["ground", "plate"])
+@pytest.mark.parametrize("surface", slow_unless(["ground"], ["ground", "plate"]))
 def test_a_flat_mesh_is_a_plane(surface):
     lidar = jl.Lidar(divergence=3.0, zenith=10.0)
     slope = 20.0 if surface == "ground" else 0.0

@@ -125,6 +125,7 @@ def test_forward_and_reverse_agree(name, build, zenith, orders, names):
         np.testing.assert_allclose(1.01 * reverse, forward, rtol=2e-4, atol=2e-5 * scale)
 
 
+@pytest.mark.slow
 def test_empty_voxels_have_their_derivative_at_first_order():
     """The gradient in a voxel of zero extinction is the difference to a little leaf there."""
     loss, key = problem(leaves_over_ground, 0.0, 1), jax.random.key(1)
