@@ -38,7 +38,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxlidar._mesh_axes import vary_with
-from jaxlidar._one_function import one_function
+from jaxlidar._one_function import once, one_function
 from jaxlidar._vectors import FAR, Scalar, Vec, cross, dot, scale, vec, with_derivative_of
 
 # Numbers in a row of the table.
@@ -432,7 +432,8 @@ def _visit_node(tree: TriangleTree, s: _TreeTraversal, any_hit: bool, precision:
         _box_distance(row[k : k + 3], row[k + 6 : k + 9], start, inverse, s.distance, precision)
         for k in (0, 3)
     ]
-    (first_met, first_near), (second_met, second_near) = boxes
+    # Each number of the next state follows from these: without `once` the compiler repeats them in all.
+    (first_met, first_near), (second_met, second_near) = once(boxes)
     descends = ~is_leaf & (first_met | second_met)
     takes_second = second_met & (~first_met | (second_near < first_near))
     # 3.
@@ -444,7 +445,7 @@ def _visit_node(tree: TriangleTree, s: _TreeTraversal, any_hit: bool, precision:
         entered = [tree.instances.at[leaf, k].get(mode="promise_in_bounds") for k in range(3)]
         next_instance = Instance(*(jnp.where(enters, a, b) for a, b in zip(entered, s.instance)))
     # 4.
-    distance = _triangle_distance(row, start, direction, instance.one_sided, precision)
+    distance = once(_triangle_distance(row, start, direction, instance.one_sided, precision))
     is_nearer = s.active & s.inside & is_leaf & (distance < s.distance)
     nearest = jnp.where(is_nearer, distance, s.distance)
     # 5.
