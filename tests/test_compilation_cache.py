@@ -11,7 +11,6 @@ import pytest
 import jaxlidar as jl
 from jaxlidar import _compilation_cache
 from jaxlidar._programs import Program
-from tests.helpers import slow_unless
 
 
 def cached_files(folder):
@@ -63,7 +62,8 @@ def cosine_or_sine(scale, name):
     return Scaled(jnp.sin(scale), name)
 
 
-@pytest.mark.parametrize("ahead", slow_unless([True], [False, True]))
+@pytest.mark.slow
+@pytest.mark.parametrize("ahead", [False, True])
 def test_executables_are_loaded_without_being_traced(tmp_path, ahead, monkeypatch):
     # JAX's own cache takes no part, however long a busy machine compiles.
     monkeypatch.setattr(_compilation_cache, "MIN_COMPILE_TIME", np.inf)

@@ -178,7 +178,8 @@ SCENES = {
 }
 
 
-@pytest.mark.parametrize("name", slow_unless(["mirror"], SCENES))
+@pytest.mark.slow
+@pytest.mark.parametrize("name", SCENES)
 def test_returns_are_the_first_order_without_the_pulse(name):
     lidar = jl.Lidar(wavelength=(532.0, 1064.0), **NARROW_BEAM)
     scene = SCENES[name]()

@@ -26,7 +26,7 @@ def script(monkeypatch):
     sys.modules.pop("_common", None)
 
 
-LONG = ("introduction", *(f"figure_{n:02}" for n in (5, 6, 7, 8, 9, 12)), "figures_13_14")
+LONG = ("introduction", *(f"figure_{n:02}" for n in (1, 5, 6, 7, 8, 9, 12)), "figures_13_14")
 
 
 def test_every_figure_of_the_paper_that_shows_numbers_has_a_script():

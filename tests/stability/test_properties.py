@@ -136,7 +136,8 @@ def assert_alike(actual, expected, tolerance=1e-6):
     np.testing.assert_allclose(actual, expected, rtol=0, atol=tolerance * np.max(expected) + 1e-12)
 
 
-@pytest.mark.parametrize("precision", [pytest.param("float32", marks=pytest.mark.slow), "float64"])
+@pytest.mark.slow
+@pytest.mark.parametrize("precision", ["float32", "float64"])
 @usually(max_examples=25)
 @given(p=scenes())
 def test_finite_and_not_negative_and_no_more_than_was_emitted(precision, p):

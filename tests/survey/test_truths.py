@@ -67,6 +67,7 @@ def test_truths_are_those_of_each_shot_alone(waveforms):
     assert np.allclose(waveforms.first_order_share, 1.0)
 
 
+@pytest.mark.slow
 def test_truths_are_stored_in_files_and_a_killed_run_continues(waveforms, tmp_path):
     path = tmp_path / "many.nc"
 

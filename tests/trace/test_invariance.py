@@ -102,6 +102,7 @@ def test_one_trace_serves_every_wavelength(reference_wave):
             assert_alike(component[0], wave.components[name][i], 1e-5)
 
 
+@pytest.mark.slow
 def test_moving_everything_sideways_changes_nothing(reference_wave):
     plan, wave = reference_wave
     lidar, scene = build(shift=(250.0, -120.0, 0.0))

@@ -146,6 +146,7 @@ def closed_box():
     return jl.Scene(meshes=(jl.MeshSurface(inside_out, reflectance=0.9, two_sided=False),))
 
 
+@pytest.mark.slow
 def test_no_light_leaks_from_a_closed_box():
     options = {"max_orders": 12, "n_photons": 4096, **SINGLE_SAMPLE}
     wave = jl.simulate(wide_lidar(0.1), closed_box(), key=jax.random.key(0), **options)

@@ -157,6 +157,7 @@ def test_first_order_of_a_slab_from_anywhere(height, zenith, length):
         assert abs(total(wave) - behind) > 0.02
 
 
+@pytest.mark.slow
 def test_energy_is_conserved_from_within_a_canopy():
     """Leaves and ground that absorb nothing, without sides: all light escapes, returns or is in flight."""
     scene = jl.Scene(

@@ -97,6 +97,7 @@ def profile(target, name, values, unknowns=UNKNOWNS, lidar=LIDAR, **options):
     return inversion.profile_likelihood(observed, lidar, SCENE, unknowns, name, values, **options)
 
 
+@pytest.mark.slow
 def test_a_profile_of_a_linear_problem_is_the_standard_error(target):
     observed, time = target
     fit = inversion.retrieve(

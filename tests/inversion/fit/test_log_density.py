@@ -79,6 +79,7 @@ def test_a_log_normal_prior_is_a_density_of_the_unknown_itself():
     assert std == pytest.approx(prior.std(), rel=2e-2)
 
 
+@pytest.mark.slow
 def test_noise_of_a_recorder_is_normalised_where_it_grows_with_the_scale():
     observed, time = noisy_record(ground(), 0.01)
     recorder = inversion.Recorder(offset=(-0.1, 0.1), interleaved=2, pulse_noise=0.05, correlation=0.5)

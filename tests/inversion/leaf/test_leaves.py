@@ -94,6 +94,7 @@ def test_errors_of_unequal_noise(noisy_leaves):
     assert not errors_are_as_stated(invert_leaves(BANDS, R, T + 0.02 * added_noise, noise=NOISE), truth)
 
 
+@pytest.mark.slow
 def test_fixed_traits_keep_their_values_leaf_by_leaf(noisy_leaves):
     truth, data = noisy_leaves
     fixed_traits = {name: jnp.asarray(truth[name]) for name in ("Cant", "Cbrown")}

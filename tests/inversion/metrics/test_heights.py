@@ -83,6 +83,7 @@ def test_a_mode_beyond_the_tail_is_ground():
     assert float(find_ground(HEIGHT, weak, pulse=system_pulse(), noise=0.5)) == pytest.approx(3.03, abs=0.2)
 
 
+@pytest.mark.slow
 def test_the_pulse_may_be_one_of_jaxlidars_and_its_zero_anywhere():
     # The pulse's mode is 9 samples after its time zero, from which heights count.
     late = np.roll(system_pulse(), 9)

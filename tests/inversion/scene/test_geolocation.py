@@ -71,6 +71,7 @@ def test_footprints_are_sums_of_narrow_beams_with_exact_derivatives(case, nodes)
         assert np.abs(direct - wave).max() < 0.03 * wave.max()
 
 
+@pytest.mark.slow
 def test_the_shift_is_found_from_waveforms(case):
     scene, survey, waves = case
     place = inversion.geolocate(
