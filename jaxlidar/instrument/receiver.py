@@ -42,6 +42,7 @@ from jaxlidar._checks import (
 )
 from jaxlidar._constants import PLANCK_TIMES_LIGHT
 from jaxlidar._converted import Converted
+from jaxlidar._not_kept import check_kept
 from jaxlidar._products import einsum
 from jaxlidar._ranges import Range, check_ranges
 from jaxlidar._signatures import briefly
@@ -212,6 +213,8 @@ def record(
     is_waveform = hasattr(wave, "energy")
     if is_waveform and wavelength is not None:
         raise ValueError("wavelength is given, but wave is a waveform, which has its own")
+    if is_waveform:
+        check_kept(wave.energy)
     if mode == "photons":
         return count_photons(wave, PhotonCounter() if receiver is None else receiver, key, pulses)
     if check_integer("pulses", pulses) != 1:

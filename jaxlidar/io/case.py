@@ -48,8 +48,8 @@ from jaxlidar.simulate import simulate
 # Arguments of `simulate` that a file cannot hold, or that a case has as fields.
 _EXCLUDED_ARGUMENTS = ("lidar", "scene", "key", "plan", "progress")
 _SECTIONS = ("lidar", "survey", "scene", "simulate")
-# Arguments of `simulate_many`; `simulate` has all but the last as well.
-_SURVEY_ARGUMENTS = ("rtol", "max_orders", "truth", "shared")
+# Arguments of `simulate_many`; `simulate` has all but the last two as well.
+_SURVEY_ARGUMENTS = ("rtol", "max_orders", "truth", "shared", "keep")
 
 
 @final
@@ -63,7 +63,7 @@ class Case:
     - `scene`: a `Scene`, or None. Default None.
     - `key`: a JAX random key, or None. Default None.
     - `arguments`: by name, other arguments of `jaxlidar.simulate`, such as `rtol`; all but `plan` and
-      `progress`. With a survey: `rtol`, `max_orders` and `shared`. Default: none.
+      `progress`. With a survey: `rtol`, `max_orders`, `truth`, `shared` and `keep`. Default: none.
     - `survey`: a `Survey`, which is simulated in place of the lidar, or None. Default None.
 
     **Raises:** TypeError for an object of another class; ValueError for an unknown argument, and, with a
@@ -201,7 +201,11 @@ def case_of(text: str, path: Path, read_array: ArrayReader) -> Case:
         check_kind("simulate", table, dict, "a table")
         signature = _simulate_arguments()
         if survey is not None:
-            signature = {**signature, "shared": Argument(bool | None, False, "", "shared")}
+            signature = {
+                **signature,
+                "shared": Argument(bool | None, False, "", "shared"),
+                "keep": Argument(tuple[str, ...], False, "", "keep"),
+            }
         check_keys(table, (*signature, "seed", "key", "key_kind"), "simulate")
         arguments = {
             name: value_of(table[name], signature[name], f"simulate.{name}", read_array, path.parent)

@@ -8,6 +8,7 @@ The annotations of a class decide what becomes of its fields:
 | dict of such arrays | one variable with one more dimension, the first, whose coordinate has the keys |
 | dict of arrays of any shape, "..." | a variable "FIELD.NUMBER.KEY" for each, with the attribute `item` |
 | static field | an attribute, as JSON; a tuple of texts is a coordinate |
+| array or dict that is `NotKept` | the attribute null |
 | `Scene` or `Lidar` | an attribute, as TOML of a `Case`; its long arrays in the group "FIELD_arrays" |
 | object of another known class | the group of the field's name |
 
@@ -33,6 +34,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool
 
+from jaxlidar._not_kept import NotKept
 from jaxlidar.instrument.lidar import Lidar
 from jaxlidar.io.case import Case, case_of, case_text
 from jaxlidar.io.checks import refuse_damage
@@ -210,6 +212,8 @@ def datasets_of(result: Any, group: str = "/", *, row_values: bool = True) -> di
         inner_group = f"{group.rstrip('/')}/{name}"
         if field.metadata.get("static"):
             builder.add_static(name, value)
+        elif isinstance(value, NotKept):
+            builder.add_static(name, None)
         elif (dimensions := _array_dimensions(field.type)) is not None:
             builder.add_array(name, name, dimensions, value)
         elif (annotation := _item_annotation(field.type)) is not None:
@@ -377,7 +381,8 @@ class _GroupReader:
         fields = {field.name: self._field(layout, field) for field in dataclasses.fields(layout.kind)}
         if layout.rows is not None:
             checksums = self._numbers(CHECKSUMS)
-            check_rows(place, checksums, {name: fields[name] for name in layout.row_variables.names})
+            row_fields = {name: fields[name] for name in layout.row_variables.names}
+            check_rows(place, checksums, {n: v for n, v in row_fields.items() if not isinstance(v, NotKept)})
         try:
             return layout.kind(**fields)
         except (ValueError, TypeError) as error:
@@ -391,6 +396,12 @@ class _GroupReader:
             name = former_name
         if field.metadata.get("static"):
             return self._static(name, annotation)
+        if (
+            _dimensions(annotation) is not None
+            and name not in self.dataset.variables
+            and self.dataset.attrs.get(name) == "null"
+        ):
+            return NotKept(name)
         if _array_dimensions(annotation) is not None:
             return self._array(name, annotation, has_rows)
         if (item_annotation := _item_annotation(annotation)) is not None:

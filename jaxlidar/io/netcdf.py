@@ -13,6 +13,7 @@ import numpy as np
 
 from jaxlidar._files import atomic_write
 from jaxlidar._fingerprint import version_of
+from jaxlidar._not_kept import NotKept
 from jaxlidar._registry import save_result
 from jaxlidar.instrument.photon_counter import PhotonEvents
 from jaxlidar.io.case import Case
@@ -139,7 +140,9 @@ def _new_file(result: Any, path: str | os.PathLike[str], case: Case | None) -> I
     for group, dataset in datasets.items():
         layout = LAYOUTS.get(dataset.attrs.get(KIND, ""))
         if layout is not None and layout.rows is not None:
-            rows[group] = layout.row_variables
+            row_variables = layout.row_variables
+            names = tuple(name for name in row_variables.names if name in dataset.variables)
+            rows[group] = row_variables._replace(names=names)
             checksums = np.zeros(dataset.sizes[rows[group].dimension], np.uint32)
             datasets[group] = dataset.assign({CHECKSUMS: (rows[group].dimension, checksums)})
     with atomic_write(path) as draft, store.create(draft, datasets, rows) as file:
@@ -170,7 +173,8 @@ def _inner_results(result: Any, group: str) -> dict[str, tuple[Any, str]]:
 
 def _row_writer(file: Store, result: Any, group: str) -> RowWriter:
     """Return the writer of the rows of a result, and of the objects in its fields that have rows."""
-    fields = LAYOUTS[type(result).__name__].row_variables.names
+    names = LAYOUTS[type(result).__name__].row_variables.names
+    fields = [name for name in names if not isinstance(getattr(result, name), NotKept)]
     return RowWriter(
         variables={name: file.variable(group, name) for name in fields},
         items={name: list(v) for name in fields if isinstance(v := getattr(result, name), dict)},

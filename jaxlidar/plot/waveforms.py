@@ -217,7 +217,7 @@ def waterfall(
     colours = material_colours(components)
     # From the right: each waveform may reach over its neighbour to the right, and is drawn in front of it.
     for i in np.argsort(-places, kind="stable"):
-        height = np.asarray(waves[int(rows[i])].height, float)
+        height = waves.height_of_shot(int(rows[i]))
         (visible,) = np.nonzero(np.abs(power[i]) > VISIBLE_FRACTION * max(largest, 1e-300))
         if visible.size == 0:
             continue

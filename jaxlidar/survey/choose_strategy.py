@@ -19,6 +19,7 @@ from jaxlidar.scenes.scene import Scene
 from jaxlidar.survey.footprint_splines import FootprintSplines, fit_footprints
 from jaxlidar.survey.node_groups import IlluminatedNodes, NodeGroup, illuminated_nodes, make_groups
 from jaxlidar.survey.per_shot import PerShotStrategy
+from jaxlidar.survey.results import OPTIONAL_ARRAYS
 from jaxlidar.survey.shared_illumination import SharedIlluminationStrategy
 from jaxlidar.survey.strategy import AbstractStrategy
 from jaxlidar.survey.view_geometry import ViewGeometry
@@ -55,10 +56,12 @@ def choose_strategy(
     max_orders: int | None,
     shared: bool | None,
     window: tuple[float, float] | None = None,
+    kept_names: tuple[str, ...] = OPTIONAL_ARRAYS,
 ) -> AbstractStrategy:
     """Return the strategy for the shots of a survey over one scene; arguments are those of `simulate_many`.
 
-    `window`: times of the first and the last sample, ns; None: those that the scene needs.
+    `window`: times of the first and the last sample, ns; None: those that the scene needs. `kept_names`: of
+    the `OPTIONAL_ARRAYS` that results have.
     """
     plan = make_plan(survey, scene, rtol=rtol, max_orders=max_orders, window=window, describe=False)
     rtol = DEFAULT_RTOL if rtol is None else float(rtol)
@@ -73,8 +76,8 @@ def choose_strategy(
     # moved keeps its coordinates, and the lidar its position.
     lidar, _ = move_aim_to_origin(middle, scene)
     relative_survey = survey.about((concrete_array(middle.position) - concrete_array(lidar.position))[:2])
-    strategy = _shared_illumination(relative_survey, setup, rtol, shared)
-    return PerShotStrategy(setup, relative_survey, rtol) if strategy is None else strategy
+    strategy = _shared_illumination(relative_survey, setup, rtol, kept_names, shared)
+    return PerShotStrategy(setup, relative_survey, rtol, kept_names) if strategy is None else strategy
 
 
 def _rays_of_batch(plan: Plan, survey: Survey, scene: Scene, rtol: float) -> int:
@@ -103,7 +106,7 @@ def _power_of_two(x: float, low: int, high: int) -> int:
 
 
 def _shared_illumination(
-    survey: Survey, setup: Setup, rtol: float, shared: bool | None
+    survey: Survey, setup: Setup, rtol: float, kept_names: tuple[str, ...], shared: bool | None
 ) -> SharedIlluminationStrategy | None:
     """Return the strategy with shared light, or None where shots cannot share it, or where it does not pay.
 
@@ -144,7 +147,9 @@ def _shared_illumination(
     groups = _groups(splines, nodes, setup, photons_divisor)
     view_geometry = ViewGeometry.of(survey, groups, splines.spacing) if tallies_by_shot else None
     bound = _parallel_light_bound(survey, setup)
-    return SharedIlluminationStrategy(setup, survey, rtol, groups, splines.spacing, view_geometry, bound)
+    return SharedIlluminationStrategy(
+        setup, survey, rtol, kept_names, groups, splines.spacing, view_geometry, bound
+    )
 
 
 def _tallies_by_shot(survey: Survey) -> bool:

@@ -73,7 +73,7 @@ def waveforms_in_memory(
     blocks = [results for _, results in strategy.shot_results(task_results)]
     results: ShotResults = jax.tree.map(lambda *a: np.concatenate(a), *blocks)
     _warn_of_missing_light(strategy, _MissingLight.of(results))
-    return _waveforms(strategy, {**survey_fields, **results._asdict()}, start_time, **info)
+    return _waveforms(strategy, {**survey_fields, **results.waveform_fields()}, start_time, **info)
 
 
 def waveforms_on_disk(
@@ -92,13 +92,13 @@ def waveforms_on_disk(
     blocks, missing = strategy.shot_results(task_results), _MissingLight()
     first_shots, first_results = next(blocks)
     # The file is laid out before its rows are known: from the shapes of the first block.
-    empty = jax.tree.map(lambda a: unwritten_rows(len(strategy.survey), a), first_results._asdict())
+    empty = jax.tree.map(lambda a: unwritten_rows(len(strategy.survey), a), first_results.waveform_fields())
     layout = _waveforms(strategy, {**survey_fields, **empty}, start_time, **info)
     with by_rows(layout, path, case) as rows:
         # One block of results is in memory at a time, whatever the number of shots.
         for shots, results in itertools.chain([(first_shots, first_results)], blocks):
             fields = {name: _rows(value, shots) for name, value in survey_fields.items()}
-            rows.add(shots, {**fields, **results._asdict()})
+            rows.add(shots, {**fields, **results.waveform_fields()})
             missing = missing.or_more(_MissingLight.of(results))
     _warn_of_missing_light(strategy, missing)
     return Waveforms.open(path)
@@ -132,11 +132,7 @@ def _waveforms(
 
 
 class _MissingLight(NamedTuple):
-    """Largest fractions, over shots and wavelengths, of light that waveforms lack.
-
-    - `late`: of the emitted light, after the end of the record. - `unfollowed`: of the waveform, that orders
-      beyond the last may add.
-    """
+    """Largest fractions of all shots of light that waveforms lack; see `ShotResults`."""
 
     late: float = 0.0
     unfollowed: float = 0.0
@@ -144,11 +140,7 @@ class _MissingLight(NamedTuple):
     @staticmethod
     def of(results: ShotResults) -> "_MissingLight":
         """Return the missing light of some shots."""
-        total = np.sum(results.reflectance, axis=-1)
-        return _MissingLight(
-            float(np.max(results.energy_budget["after the window"], initial=0.0)),
-            float(np.max(results.neglected / np.maximum(total, 1e-30), initial=0.0)),
-        )
+        return _MissingLight(*(float(np.max(a, initial=0.0)) for a in (results.late, results.unfollowed)))
 
     def or_more(self, second: "_MissingLight") -> "_MissingLight":
         """Return the larger of each fraction."""

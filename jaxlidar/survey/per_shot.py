@@ -152,7 +152,12 @@ class PerShotStrategy(AbstractStrategy):
 
     def tasks(self, key: PRNGKeyArray) -> list[WorkUnit]:
         return [
-            task(number, trace_chunk, (self.setup, self._chunk_geometry(shots), self.rtol), key)
+            task(
+                number,
+                trace_chunk,
+                (self.setup, self._chunk_geometry(shots), self.rtol, self.kept_names),
+                key,
+            )
             for number, shots in enumerate(self.shot_slices)
         ]
 
@@ -180,9 +185,11 @@ class PerShotStrategy(AbstractStrategy):
         return {"shared": False}
 
 
-def trace_chunk(setup: Setup, shots: ShotGeometry, rtol: float, key: PRNGKeyArray) -> ShotResults:
+def trace_chunk(
+    setup: Setup, shots: ShotGeometry, rtol: float, kept_names: tuple[str, ...], key: PRNGKeyArray
+) -> ShotResults:
     """Trace a chunk of shots."""
-    return compiled_shots(setup, shots.as_arrays(), key, jnp.asarray(rtol))
+    return compiled_shots(setup, shots.as_arrays(), key, jnp.asarray(rtol), kept_names)
 
 
 class ShotBatch(NamedTuple):
@@ -220,7 +227,12 @@ def _aim_shot(scene: DeviceScene, setup: Setup, shot: ShotGeometry, key: PRNGKey
 
 
 def _trace_shot(
-    scene: DeviceScene, setup: Setup, shot: ShotGeometry, key: PRNGKeyArray, rtol: Array
+    scene: DeviceScene,
+    setup: Setup,
+    shot: ShotGeometry,
+    key: PRNGKeyArray,
+    rtol: Array,
+    kept_names: tuple[str, ...],
 ) -> ShotResults:
     """Trace one shot until its tolerance is met.
 
@@ -232,19 +244,21 @@ def _trace_shot(
         batch = ShotBatch.of_response(trace_device_scene(aimed.scene, aimed.key), aimed.model)
         waveform, energy_budget = jax.tree.map(jnp.zeros_like, _with_errors(batch))
         errors = ShotErrors(waveform, energy_budget, jnp.zeros(()))
-        return make_shot_results(aimed.model, *batch, errors, photons=jnp.zeros((), jnp.int32))
+        return make_shot_results(
+            aimed.model, *batch, errors, photons=jnp.zeros((), jnp.int32), kept_names=kept_names
+        )
     if scene.config.follows_higher_orders:
-        return _shot_results(aimed, _add_batches(aimed, rtol))
-    return _shot_results(aimed, _densify_lattices(aimed, rtol))
+        return _shot_results(aimed, _add_batches(aimed, rtol), kept_names)
+    return _shot_results(aimed, _densify_lattices(aimed, rtol), kept_names)
 
 
-def _shot_results(aimed: AimedShot, estimate: RunningMoments) -> ShotResults:
+def _shot_results(aimed: AimedShot, estimate: RunningMoments, kept_names: tuple[str, ...]) -> ShotResults:
     """Return the results of a shot from the moments of its batches."""
     waveform_stderr, energy_budget_stderr = estimate.stderr
     errors = ShotErrors(waveform_stderr, energy_budget_stderr, _relative_error(estimate))
     mean: ShotBatch = estimate.mean_only
     photons = estimate.count * aimed.setup.plan.photons_traced
-    return make_shot_results(aimed.model, *mean, errors, photons=photons)
+    return make_shot_results(aimed.model, *mean, errors, photons=photons, kept_names=kept_names)
 
 
 def _with_errors(batch: ShotBatch) -> tuple[Array, dict[str, Array]]:
@@ -348,7 +362,12 @@ def _are_narrow(setup: Setup, scene: DeviceScene) -> bool:
 
 
 def _trace_narrow_shots(
-    scene: DeviceScene, setup: Setup, shots: ShotGeometry, key: PRNGKeyArray, rtol: Array
+    scene: DeviceScene,
+    setup: Setup,
+    shots: ShotGeometry,
+    key: PRNGKeyArray,
+    rtol: Array,
+    kept_names: tuple[str, ...],
 ) -> ShotResults:
     """Trace the lattices of narrow shots, again with more parts for those that are not within the tolerance.
 
@@ -368,7 +387,8 @@ def _trace_narrow_shots(
         return (n_parts == 0) | ((results.error > rtol) & (n_parts < max_parts))
 
     def trace_some(numbers: Array, n_parts: Array) -> ShotResults:
-        return _trace_together(scene, setup, jax.tree.map(lambda a: a[numbers], shots), n_parts, key)
+        shots_of_group = jax.tree.map(lambda a: a[numbers], shots)
+        return _trace_together(scene, setup, shots_of_group, n_parts, key, kept_names)
 
     def next_round(state: tuple[Array, ShotResults]) -> tuple[Array, ShotResults]:
         n_parts, results = state
@@ -397,7 +417,12 @@ def _trace_narrow_shots(
 
 
 def _trace_together(
-    scene: DeviceScene, setup: Setup, shots: ShotGeometry, n_parts: Int[Array, "*shots"], key: PRNGKeyArray
+    scene: DeviceScene,
+    setup: Setup,
+    shots: ShotGeometry,
+    n_parts: Int[Array, "*shots"],
+    key: PRNGKeyArray,
+    kept_names: tuple[str, ...],
 ) -> ShotResults:
     """Trace the lattices of a group of shots, each in `n_parts` parts.
 
@@ -457,19 +482,21 @@ def _trace_together(
         values = jax.vmap(lambda response: _total_and_budget(response, aimed.model))(responses)
         moments = RunningMoments.of_batches(values, responses)
         batch = ShotBatch.of_response(moments.mean_only, aimed.model)
-        return _shot_results(aimed, moments._replace(mean_only=batch))
+        return _shot_results(aimed, moments._replace(mean_only=batch), kept_names)
 
     return jax.vmap(results_of)(shots, sums)
 
 
-def _trace_shots(setup: Setup, shots: ShotGeometry, key: PRNGKeyArray, rtol: Array) -> ShotResults:
+def _trace_shots(
+    setup: Setup, shots: ShotGeometry, key: PRNGKeyArray, rtol: Array, kept_names: tuple[str, ...]
+) -> ShotResults:
     """Trace shots over one device scene."""
     scene = build_device_scene(setup, derivatives="none")
     if _are_narrow(setup, scene):
-        return _trace_narrow_shots(scene, setup, shots, key, rtol)
+        return _trace_narrow_shots(scene, setup, shots, key, rtol, kept_names)
     # Not `vmap`: the loops of all shots together would run until the slowest of them has met its tolerance,
     # and their arrays would not fit into a processor's cache.
-    return jax.lax.map(lambda shot: _trace_shot(scene, setup, shot, key, rtol), shots)
+    return jax.lax.map(lambda shot: _trace_shot(scene, setup, shot, key, rtol, kept_names), shots)
 
 
 compiled_shots = Program(_trace_shots, **ONE_CORE)

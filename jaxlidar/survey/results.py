@@ -2,8 +2,10 @@
 
 from typing import Any, NamedTuple
 
+import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
+from jaxlidar._not_kept import NotKept
 from jaxlidar.instrument.receiver import digitise
 from jaxlidar.spectral.apply_optics import BudgetTerms, WaveformModel
 from jaxlidar.spectral.waveform import energy_at_reference
@@ -13,24 +15,48 @@ _PerSample = Float[Any, "*shots wavelengths samples"]
 _PerWavelength = Float[Any, "*shots wavelengths"]
 
 
+# Arrays of `Waveforms` that `simulate_many(keep=...)` may leave out, each a field of `ShotResults`.
+OPTIONAL_ARRAYS = (
+    "reflectance",
+    "stderr",
+    "energy",
+    "recorded",
+    "components",
+    "energy_budget",
+    "energy_budget_stderr",
+)
+
+
 class ShotResults(NamedTuple):
     """Results of one shot, or of several along axis 0. The quantities are those of `Waveforms`.
 
-    `truth`: a `Truths`, or None.
+    - `late`: of the emitted light, the fraction after the end of the record. - `unfollowed`: of the waveform,
+      the fraction that orders beyond the last may add. Both are the largest of all wavelengths.
+    - `OPTIONAL_ARRAYS`: None where they are not kept. - `truth`: a `Truths`, or None.
     """
 
-    reflectance: _PerSample
-    stderr: _PerSample
-    energy: _PerSample
-    recorded: _PerSample
-    components: dict[str, _PerSample]
     neglected: _PerWavelength
     lost: _PerWavelength
-    energy_budget: dict[str, _PerWavelength]
-    energy_budget_stderr: dict[str, _PerWavelength]
     error: Float[Any, "*shots"]
     photons: Int[Any, "*shots"]
+    late: Float[Any, "*shots"]
+    unfollowed: Float[Any, "*shots"]
+    reflectance: _PerSample = None
+    stderr: _PerSample = None
+    energy: _PerSample = None
+    recorded: _PerSample = None
+    # Dicts of such arrays.
+    components: Any = None
+    energy_budget: Any = None
+    energy_budget_stderr: Any = None
     truth: Any = None
+
+    def waveform_fields(self) -> dict[str, Any]:
+        """Return the fields that `Waveforms` has, too; arrays that are not kept are `NotKept`."""
+        fields = self._asdict()
+        for name in ("late", "unfollowed"):
+            del fields[name]
+        return fields | {name: NotKept(name) for name in OPTIONAL_ARRAYS if fields[name] is None}
 
 
 class ShotErrors(NamedTuple):
@@ -48,24 +74,32 @@ def make_shot_results(
     budget: BudgetTerms,
     errors: ShotErrors,
     photons: Array,
+    kept_names: tuple[str, ...],
 ) -> ShotResults:
     """Return the results of one shot from its components, its energy budget and their errors.
 
     `relative_energy`: see `jaxlidar.spectral.apply_optics.relative_energy_samples`. `photons`: number of
-    photons traced.
+    photons traced. `kept_names`: those of `OPTIONAL_ARRAYS` to return. The compiler leaves out what only the
+    others need.
     """
     lidar, reflectance = model.lidar, components["first"] + components["higher"]
     energy = energy_at_reference(lidar)[:, None] * relative_energy
+    optional_arrays = {
+        "reflectance": reflectance,
+        "stderr": errors.waveform,
+        "energy": energy,
+        "recorded": digitise(energy, lidar.wavelength, lidar.receiver),
+        "components": components,
+        "energy_budget": budget.energy_budget,
+        "energy_budget_stderr": errors.energy_budget,
+    }
+    total = jnp.maximum(jnp.sum(reflectance, axis=-1), 1e-30)
     return ShotResults(
-        reflectance=reflectance,
-        stderr=errors.waveform,
-        energy=energy,
-        recorded=digitise(energy, lidar.wavelength, lidar.receiver),
-        components=components,
         neglected=budget.neglected,
         lost=budget.lost,
-        energy_budget=budget.energy_budget,
-        energy_budget_stderr=errors.energy_budget,
         error=errors.relative,
         photons=photons,
+        late=jnp.max(budget.energy_budget["after the window"]),
+        unfollowed=jnp.max(budget.neglected / total),
+        **{name: optional_arrays[name] for name in kept_names},
     )

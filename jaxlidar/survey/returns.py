@@ -47,6 +47,7 @@ from jaxlidar._checks import (
     check_range,
 )
 from jaxlidar._constants import SPEED_OF_LIGHT
+from jaxlidar._not_kept import NotKept
 from jaxlidar._registry import decompose_records
 from jaxlidar.instrument.lidar import Lidar
 from jaxlidar.instrument.survey import Survey, beam_directions
@@ -269,8 +270,8 @@ class DetectorInput:
 
     time: Float[np.ndarray, " samples"]
     recorded: Float[np.ndarray, "shots samples"]
-    energy: Float[np.ndarray, "shots samples"]
-    stderr: Float[np.ndarray, "shots samples"]
+    energy: Float[np.ndarray, "shots samples"] | NotKept
+    stderr: Float[np.ndarray, "shots samples"] | NotKept
     components: Mapping[str, Float[np.ndarray, "shots samples"]]
     truth: Mapping[str, Float[np.ndarray, "shots samples"]] | None
     surface_height: Mapping[str, Float[np.ndarray, " shots"]]
@@ -320,8 +321,9 @@ def input_of_waveforms(waves: Any, wavelength: Any) -> DetectorInput:
     return DetectorInput(
         time=np.asarray(waves.time, float),
         recorded=waves.recorded[:, w],
-        energy=waves.energy[:, w],
-        stderr=waves.stderr[:, w],
+        # Not needed with `background` and `noise`: whoever needs them will be told that they were not kept.
+        energy=waves.energy if isinstance(waves.energy, NotKept) else waves.energy[:, w],
+        stderr=waves.stderr if isinstance(waves.stderr, NotKept) else waves.stderr[:, w],
         components={name: a[:, w] for name, a in waves.components.items() if name not in _ORDERS},
         truth=None if waves.truth is None else {name: a[:, w] for name, a in waves.truth.returns.items()},
         surface_height={} if waves.truth is None else waves.truth.surface_height,

@@ -143,7 +143,7 @@ class SharedIlluminationStrategy(AbstractStrategy):
             ]
             # One contribution at a time is in memory: the mapping may be one of files.
             contributions = (task_results[number] for number in numbers)
-            yield shots, sum_contributions(self.context, contributions, shots)
+            yield shots, sum_contributions(self.context, contributions, shots, self.kept_names)
 
     def info(self) -> dict[str, Any]:
         return {
@@ -470,9 +470,15 @@ class ShotSums(NamedTuple):
 
 
 def sum_contributions(
-    context: GroupContext, contributions: Iterable[GroupContribution], shots: slice
+    context: GroupContext,
+    contributions: Iterable[GroupContribution],
+    shots: slice,
+    kept_names: tuple[str, ...],
 ) -> ShotResults:
-    """Return the results of at most `SHOTS_PER_BLOCK` shots, from the contributions of groups."""
+    """Return the results of at most `SHOTS_PER_BLOCK` shots, from the contributions of groups.
+
+    `kept_names`: as in `make_shot_results`.
+    """
     sums: Any = None
     for contribution in contributions:
         mine = (contribution.shots >= shots.start) & (contribution.shots < shots.stop)
@@ -490,12 +496,14 @@ def sum_contributions(
         energy_stderr=jax.tree.map(np.sqrt, sums["energy_variance"]),
     )
     of_shots, count = jax.tree.map(lambda a: jnp.asarray(a, float), of_shots), shots.stop - shots.start
-    padded = _compiled_complete(context.model, context.air, of_shots)
+    padded = _compiled_complete(context.model, context.air, of_shots, kept_names)
     results: ShotResults = jax.tree.map(lambda a: np.asarray(a)[:count], padded)
     return results._replace(photons=sums["photons"][:count].astype(int))
 
 
-def _complete_shot(model: WaveformModel, air: AirReturn | None, sums: ShotSums) -> ShotResults:
+def _complete_shot(
+    model: WaveformModel, air: AirReturn | None, sums: ShotSums, kept_names: tuple[str, ...]
+) -> ShotResults:
     """Return the results of one shot."""
     # The last components are the first order and the relative energy, which are no further light.
     by_component, reflectance = (
@@ -512,11 +520,15 @@ def _complete_shot(model: WaveformModel, air: AirReturn | None, sums: ShotSums) 
     energy_budget_stderr = budget_stderr_of_sums(ResponseSums(**sums.energy_stderr), model)
     shot_errors = ShotErrors(sums.stderr, energy_budget_stderr, relative_error(reflectance, sums.stderr))
     no_photons = jnp.zeros((), jnp.int32)
-    return make_shot_results(model, by_component, relative_energy, budget, shot_errors, no_photons)
+    return make_shot_results(
+        model, by_component, relative_energy, budget, shot_errors, no_photons, kept_names
+    )
 
 
-def _complete_shots(model: WaveformModel, air: AirReturn | None, sums: ShotSums) -> ShotResults:
-    return jax.vmap(lambda shot: _complete_shot(model, air, shot))(sums)
+def _complete_shots(
+    model: WaveformModel, air: AirReturn | None, sums: ShotSums, kept_names: tuple[str, ...]
+) -> ShotResults:
+    return jax.vmap(lambda shot: _complete_shot(model, air, shot, kept_names))(sums)
 
 
 _compiled_complete = Program(_complete_shots)

@@ -12,7 +12,7 @@ import functools
 import os
 import time
 import warnings
-from collections.abc import Callable, Iterator, Mapping, MutableMapping
+from collections.abc import Callable, Collection, Iterator, Mapping, MutableMapping
 from concurrent.futures import Executor
 from pathlib import Path
 from typing import Any
@@ -20,7 +20,15 @@ from typing import Any
 import jax
 from jaxtyping import PRNGKeyArray
 
-from jaxlidar._checks import check_flag, check_integer, check_key, check_kind, is_traced, is_within_program
+from jaxlidar._checks import (
+    check_choice,
+    check_flag,
+    check_integer,
+    check_key,
+    check_kind,
+    is_traced,
+    is_within_program,
+)
 from jaxlidar._fingerprint import fingerprint
 from jaxlidar._registry import simulate_survey
 from jaxlidar._workers import WorkUnit, outcomes
@@ -34,6 +42,7 @@ from jaxlidar.survey.choose_strategy import choose_strategy
 from jaxlidar.survey.collect import StoredResults, waveforms_in_memory, waveforms_on_disk
 from jaxlidar.survey.coverage import OffMapWarning, ground_heights, off_map, off_map_message
 from jaxlidar.survey.progress import ProgressClock, SurveyProgress
+from jaxlidar.survey.results import OPTIONAL_ARRAYS
 from jaxlidar.survey.strategy import AbstractStrategy
 from jaxlidar.survey.tiled_scene import TiledSceneStrategy
 from jaxlidar.survey.truths import StrategyWithTruth
@@ -54,6 +63,7 @@ def simulate_many(
     progress: Callable[[SurveyProgress], None] | None = None,
     shared: bool | None = None,
     truth: bool = False,
+    keep: Collection[str] | None = None,
 ) -> Waveforms:
     """Simulate the waveforms that all shots of a survey record of one scene.
 
@@ -105,6 +115,10 @@ def simulate_many(
       per shot. Default None: shared where it is possible and saves time.
     - `truth`: True adds `Waveforms.truth`: reference quantities computed from the scene itself (gap
       probability, area densities, heights), to train or to test retrieval algorithms. Default False.
+    - `keep`: names of the arrays to keep, of "reflectance", "stderr", "energy", "recorded", "components",
+      "energy_budget" and "energy_budget_stderr"; for instance ("recorded", "energy", "stderr", "components")
+      for `Waveforms.returns`. The others are neither in memory nor in the file, and their use is refused.
+      Default None: all.
 
     **Returns:** a `Waveforms`.
 
@@ -139,6 +153,7 @@ def simulate_many(
     check_kind("progress", progress, Callable | None, "a function, or None")
     check_kind("shared", shared, bool | None, "True, False or None")
     check_flag("truth", truth)
+    kept_names = _kept_names(keep)
     if max_orders is not None:
         max_orders = check_integer("max_orders", max_orders)
     # Waveforms share one time axis, in memory and in files.
@@ -148,10 +163,10 @@ def simulate_many(
         )
     start_time = time.perf_counter()
     if isinstance(scene, SceneParts):
-        strategy = TiledSceneStrategy.of(survey, scene, rtol, max_orders, shared, truth)
+        strategy = TiledSceneStrategy.of(survey, scene, rtol, max_orders, shared, truth, kept_names)
         off_map_fractions, heights = strategy.off_map, strategy.ground_height
     else:
-        strategy = choose_strategy(survey, scene, rtol, max_orders, shared)
+        strategy = choose_strategy(survey, scene, rtol, max_orders, shared, kept_names=kept_names)
         if truth:
             strategy = StrategyWithTruth.around(strategy)
         setup = strategy.setup
@@ -185,12 +200,15 @@ def simulate_many(
             "max_orders": max_orders,
             "shared": strategy.info()["shared"],
             "truth": bool(truth),
+            # Files of earlier versions, which have all arrays, do not name them.
+            **({} if kept_names == OPTIONAL_ARRAYS else {"keep": kept_names}),
         }
     )
     path = Path(path)
     if path.exists():
         return _open_complete(path, problem)
     arguments = {"rtol": rtol, "max_orders": max_orders, "shared": shared, "truth": truth}
+    arguments |= {} if keep is None else {"keep": kept_names}
     case = None if isinstance(scene, SceneParts) else _case(survey, scene, key, arguments)
     with open_checkpoint(checkpoint_path(path), problem) as checkpoint:
         # Another run of the same problem may have ended since.
@@ -215,6 +233,18 @@ def checkpoint_path(path: str | os.PathLike[str]) -> Path:
     """Return the path of the results so far of a survey that is written to `path`."""
     path = Path(path)
     return path.with_name(path.name + ".parts")
+
+
+def _kept_names(keep: Collection[str] | None) -> tuple[str, ...]:
+    """Return the names of the arrays to keep, in order. **Raises:** TypeError and ValueError."""
+    if keep is None:
+        return OPTIONAL_ARRAYS
+    # A string is a collection, too, of letters.
+    admissible = f"names, as in keep=({', '.join(map(repr, OPTIONAL_ARRAYS))})"
+    check_kind("keep", keep, tuple | list | set | frozenset | None, f"a tuple of {admissible}, or None")
+    for name in keep:
+        check_choice("keep", name, OPTIONAL_ARRAYS)
+    return tuple(name for name in OPTIONAL_ARRAYS if name in keep)
 
 
 def _check_not_transformed(survey: Survey, scene: Scene | SceneParts, key: PRNGKeyArray) -> None:

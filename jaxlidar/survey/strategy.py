@@ -23,11 +23,13 @@ class AbstractStrategy(abc.ABC):
     - `setup`: that of the middle of the survey, or of the first tile of a tiled scene.
     - `survey`: relative to the setup's origin of coordinates; over a tiled scene, in map coordinates.
     - `rtol`: relative error to reach.
+    - `kept_names`: those of `OPTIONAL_ARRAYS` that results have.
     """
 
     setup: Setup
     survey: Survey
     rtol: float
+    kept_names: tuple[str, ...]
 
     @abc.abstractmethod
     def tasks(self, key: PRNGKeyArray) -> list[WorkUnit]:

@@ -62,6 +62,7 @@ class TileOptions(NamedTuple):
     shared: bool | None
     window: tuple[float, float]
     truth: bool
+    kept_names: tuple[str, ...]
 
 
 def tiles_of(survey: Survey, scene: SceneParts, margin: float = 0.0) -> list[SceneTile]:
@@ -143,6 +144,7 @@ class TiledSceneStrategy(AbstractStrategy):
         max_orders: int | None,
         shared: bool | None,
         truth: bool,
+        kept_names: tuple[str, ...],
     ) -> "TiledSceneStrategy":
         """Look at all parts of the scene, one after the other, and return the strategy.
 
@@ -159,12 +161,12 @@ class TiledSceneStrategy(AbstractStrategy):
             )
         starts, ends, longest_paths, orders = [], [], [], []
         for tile in tiles_of(survey, scene):
-            plan = _strategy_of(survey, scene, tile, rtol, max_orders, shared, None).setup.plan
+            plan = _strategy_of(survey, scene, tile, rtol, max_orders, shared, None, kept_names).setup.plan
             starts.append(plan.sample_start)
             ends.append(plan.sample_start + plan.sample_interval * (plan.n_samples - 1))
             longest_paths.append(float(plan.limits.max_path))
             orders.append(plan.orders)
-        options = TileOptions(rtol, max(orders), shared, (min(starts), max(ends)), truth)
+        options = TileOptions(rtol, max(orders), shared, (min(starts), max(ends)), truth, kept_names)
 
         lossless = 0.0
         if options.orders > 1:
@@ -182,7 +184,7 @@ class TiledSceneStrategy(AbstractStrategy):
         surfaces: dict[str, None] = {}
         first_strategy = None
         for tile in tiles:
-            strategy = _strategy_of(survey, scene, tile, rtol, options.orders, shared, options.window)
+            strategy = _strategy_of_tile(survey, scene, tile, options)
             first_strategy = strategy if first_strategy is None else first_strategy
             scene_part, plan = strategy.setup.scene, strategy.setup.plan
             off_map_fractions[tile.shots] = off_map(strategy.survey, scene_part)
@@ -197,6 +199,7 @@ class TiledSceneStrategy(AbstractStrategy):
             setup=first_strategy.setup,
             survey=survey,
             rtol=first_strategy.rtol,
+            kept_names=kept_names,
             scene=scene,
             tiles=tiles,
             options=options,
@@ -264,14 +267,22 @@ class TiledSceneStrategy(AbstractStrategy):
         """Return the results of a tile, with zeros for the materials that its part of the scene lacks."""
         results: ShotResults = task_results[number]
         energy_budget, energy_budget_stderr = (
-            _in_order_of_names(a, [f"absorbed by {m}" for m in self.materials], np.zeros_like(a["escaped"]))
+            None
+            if a is None
+            else _in_order_of_names(
+                a, [f"absorbed by {m}" for m in self.materials], np.zeros_like(a["escaped"])
+            )
             for a in (results.energy_budget, results.energy_budget_stderr)
         )
-        nothing = np.zeros_like(results.reflectance)
+        components = results.components
+        if components is not None:
+            components = _in_order_of_names(components, self.materials, np.zeros_like(components["first"]))
         truth = None
         if self.options.truth:
             truths: Truths = task_results[number + len(self.tiles)]
             no_height = np.full(len(truths.top_height), np.nan)
+            plan, samples = self.setup.plan, truths.gap_probability
+            nothing = np.zeros((len(samples), results.neglected.shape[1], plan.n_samples), samples.dtype)
             truth = dataclasses.replace(
                 truths,
                 returns=_in_order_of_names(truths.returns, self.materials, nothing),
@@ -279,7 +290,7 @@ class TiledSceneStrategy(AbstractStrategy):
                 surface_spread=_in_order_of_names(truths.surface_spread, self.surfaces, no_height),
             )
         return results._replace(
-            components=_in_order_of_names(results.components, self.materials, nothing),
+            components=components,
             energy_budget=energy_budget,
             energy_budget_stderr=energy_budget_stderr,
             truth=truth,
@@ -302,15 +313,27 @@ def _strategy_of(
     orders: int | None,
     shared: bool | None,
     window: tuple[float, float] | None,
+    kept_names: tuple[str, ...],
 ) -> AbstractStrategy:
     """Return the strategy of the shots of a tile. **Raises:** as `simulate_many`, with the part's corners."""
     scene_part = scene.between(tile.low, tile.high)
     try:
         check_kinds(survey.lidar, scene_part)
-        return choose_strategy(subset(survey, tile.shots), scene_part, rtol, orders, shared, window)
+        return choose_strategy(
+            subset(survey, tile.shots), scene_part, rtol, orders, shared, window, kept_names
+        )
     except ValueError as error:
         corners = f"part({tile.low.tolist()}, {tile.high.tolist()})"
         raise ValueError(f"{corners}, shots {tile.shots[:5].tolist()}: {error}") from error
+
+
+def _strategy_of_tile(
+    survey: Survey, scene: SceneParts, tile: SceneTile, options: TileOptions
+) -> AbstractStrategy:
+    """Return the strategy of the shots of a tile, with the window and the orders of all tiles."""
+    return _strategy_of(
+        survey, scene, tile, options.rtol, options.orders, options.shared, options.window, options.kept_names
+    )
 
 
 def _in_order_of_names(
@@ -330,7 +353,7 @@ def trace_tile(
 ) -> ShotResults:
     """Trace the shots of a tile."""
     # With the window and the orders of all tiles the strategy comes out as in `TiledSceneStrategy.of`.
-    strategy = _strategy_of(survey, scene, tile, options.rtol, options.orders, options.shared, options.window)
+    strategy = _strategy_of_tile(survey, scene, tile, options)
     task_results = _run_in_turn(strategy.tasks(jax.random.fold_in(key, number)))
     blocks = [results for _, results in strategy.shot_results(task_results)]
     return jax.tree.map(lambda *a: np.concatenate(a), *blocks)
@@ -345,7 +368,7 @@ def truth_of_tile(
     key: PRNGKeyArray,
 ) -> Truths:
     """Return the truth of the shots of a tile; no random numbers are drawn."""
-    strategy = _strategy_of(survey, scene, tile, options.rtol, options.orders, options.shared, options.window)
+    strategy = _strategy_of_tile(survey, scene, tile, options)
     chunks = _run_in_turn(StrategyWithTruth.around(strategy).truth_tasks(key))
     truths: Truths = jax.tree.map(
         lambda *a: np.concatenate(a), *(chunk for _, chunk in sorted(chunks.items()))

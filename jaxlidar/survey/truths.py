@@ -90,8 +90,8 @@ class StrategyWithTruth(AbstractStrategy):
     @staticmethod
     def around(light_strategy: AbstractStrategy) -> "StrategyWithTruth":
         """Return a strategy that traces light, with the truth of its shots."""
-        setup, survey, rtol = light_strategy.setup, light_strategy.survey, light_strategy.rtol
-        return StrategyWithTruth(setup, survey, rtol, light_strategy)
+        light = light_strategy
+        return StrategyWithTruth(light.setup, light.survey, light.rtol, light.kept_names, light)
 
     @property
     def shot_slices(self) -> list[slice]:

@@ -13,6 +13,7 @@ from jaxtyping import ArrayLike, Float, Int
 from jaxlidar._checks import briefly, check_numbers
 from jaxlidar._constants import SPEED_OF_LIGHT
 from jaxlidar._deprecated import renamed_property
+from jaxlidar._not_kept import NotKept
 from jaxlidar._registry import detect_returns, true_returns
 from jaxlidar._summary import NOTABLE_FRACTION, percent
 from jaxlidar.instrument.lidar import Lidar
@@ -25,6 +26,7 @@ from jaxlidar.sampling.adaptive import StopReason
 from jaxlidar.spectral.waveform import Waveform
 from jaxlidar.survey.acquisition import Acquisition
 from jaxlidar.survey.progress import SurveyProgress
+from jaxlidar.survey.results import OPTIONAL_ARRAYS
 from jaxlidar.survey.returns import (
     MAX_LAS_RETURNS,
     DiscreteReturns,
@@ -45,6 +47,9 @@ _LEAST_COSINE = 1e-12
 @briefly
 class Waveforms(eqx.Module):
     """The waveforms of all shots of a survey, on one time axis. `waves[i]` is the `Waveform` of shot i.
+
+    `simulate_many(keep=...)` may leave out arrays. Their use raises a ValueError, and so does `waves[i]`,
+    which needs all of them.
 
     - `time`: (samples,) ns, centres of the samples, relative to the two-way travel time of each shot's aim
       point; of shots that are placed by their sensors, relative to their emission.
@@ -140,6 +145,12 @@ class Waveforms(eqx.Module):
         points = start + distance[:, None] * direction
         return np.where(np.isnan(points[:, 2:]), np.nan, np.column_stack([points[:, :2], height]))
 
+    def height_of_shot(self, shot: int) -> Float[np.ndarray, " samples"]:
+        """Heights (samples,), m, from which light of order one arrives in the samples of a shot."""
+        # The survey has one time axis and shots of many zenith angles: heights differ between shots.
+        height = -0.5 * SPEED_OF_LIGHT * self.time * np.cos(np.deg2rad(self.zenith[shot]))
+        return height + self.position[shot, 2] if self.has_sensor_position else height
+
     def __len__(self) -> int:
         return len(self.position)
 
@@ -147,9 +158,12 @@ class Waveforms(eqx.Module):
         interval = self.time[1] - self.time[0] if self.time.size > 1 else 0.0
         samples = f"{self.time.size} samples of {interval:.3g} ns from {self.time[0]:.6g} ns"
         lines = [f"{len(self)} waveforms of {samples}"]
-        for w, sums in zip(self.wavelength, self.reflectance.sum(axis=2).T):
-            low, middle, high = np.quantile(sums, (0.0, 0.5, 1.0))
-            lines.append(f"  {w:g} nm: apparent reflectance {low:.3g} to {high:.3g}, median {middle:.3g}")
+        if not isinstance(self.reflectance, NotKept):
+            for w, sums in zip(self.wavelength, self.reflectance.sum(axis=2).T):
+                low, middle, high = np.quantile(sums, (0.0, 0.5, 1.0))
+                lines.append(f"  {w:g} nm: apparent reflectance {low:.3g} to {high:.3g}, median {middle:.3g}")
+        if not_kept := [name for name in OPTIONAL_ARRAYS if isinstance(getattr(self, name), NotKept)]:
+            lines.append(f"  not kept (keep=): {', '.join(not_kept)}")
         if (n_off_map := int(np.sum(self.off_map >= NOTABLE_FRACTION))) > 0:
             lines.append(f"  {n_off_map} lie partly outside the voxel map")
         light = "which share light, " if self.info.get("shared") else ""
@@ -169,11 +183,7 @@ class Waveforms(eqx.Module):
         def row(arrays: dict) -> dict:
             return {name: jnp.asarray(a[i]) for name, a in arrays.items()}
 
-        # The survey has one time axis and shots of many zenith angles: heights differ between shots.
-        height = -0.5 * SPEED_OF_LIGHT * self.time * np.cos(np.deg2rad(self.zenith[i]))
-        if self.has_sensor_position:
-            height = height + self.position[i, 2]
-        axes = jnp.asarray(self.time), jnp.asarray(height, self.time.dtype)
+        axes = jnp.asarray(self.time), jnp.asarray(self.height_of_shot(i), self.time.dtype)
         return Waveform(
             time=axes[0],
             height=axes[1],

@@ -5,6 +5,7 @@ import pytest
 
 import jaxlidar as jl
 from jaxlidar.survey.footprint_splines import BeamSection, fit_footprints, section_of, spline_error
+from jaxlidar.survey.results import OPTIONAL_ARRAYS
 from jaxlidar.survey.shared_illumination import GroupContribution, make_group_context, sum_contributions
 from tests.survey.test_simulate_many import (
     FAST,
@@ -96,7 +97,7 @@ def test_standard_errors_of_the_energy_budget_are_those_of_its_sums():
         photons=np.ones(1, int),
     )
     context = make_group_context(setup, spacing=1.0, view_geometry=None)
-    results = sum_contributions(context, [contribution], slice(0, 1))
+    results = sum_contributions(context, [contribution], slice(0, 1), OPTIONAL_ARRAYS)
     solid_angle_over_pi = float(beam.aperture_area) / (np.pi * float(beam.range_to_reference) ** 2)
     expected = {
         "returned": 0.2 * solid_angle_over_pi,
