@@ -1,76 +1,31 @@
-"""Common to the fits of recorded waveforms: a layered canopy, tables of results, a page of pictures."""
+"""Common to the fits of recorded waveforms: tables of results, and a page of pictures."""
 
 import contextlib
 import csv
 
-import equinox as eqx
-import jax.numpy as jnp
 import matplotlib
 import numpy as np
 from tqdm import tqdm
 
-import jaxlidar as jl
 from jaxlidar.io import atomic_write
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 
-LAYERS = 10
-# Spherically oriented leaves return two thirds of their reflectance: rho_v = 0.30. Over the ground's 0.20
-# that is the ratio of GEDI's level 2B algorithm, 0.6 / 0.4.
-LEAF, GROUND = jl.LeafOptics(reflectance=0.45, transmittance=0.40), 0.20
 QUALITIES = ("good", "doubtful", "bad")
 
 
-class LayeredCanopy:
-    """A horizontally uniform canopy: ten layers of equal thickness from a clearance above the ground up.
-
-    Its methods put unknowns into a scene, as `inversion.Unknown(apply=...)` needs them.
-    """
-
-    def __init__(self, clearance):
-        self.clearance = clearance
-
-    def put_ground(self, scene, height):
-        """Move the ground to a height in m, and the canopy with it."""
-        moved = jnp.asarray(scene.canopy.voxels.origin).at[2].set(height + self.clearance)
-        return eqx.tree_at(lambda s: (s.ground.height, s.canopy.voxels.origin), scene, (height, moved))
-
-    def put_height(self, scene, height):
-        """Stretch the canopy to a top at `height` in m above the ground."""
-        step = (height - self.clearance) / LAYERS
-        size = jnp.asarray(scene.canopy.voxels.voxel_size).at[2].set(step)
-        return eqx.tree_at(lambda s: s.canopy.voxels.voxel_size, scene, size)
-
-    def put_density(self, scene, log_density):
-        """Set the layers' plant area density, from below, by its logarithm in m2/m3."""
-        # Extinction is G times the density, with G = 0.5 for spherically oriented leaves.
-        extinction = 0.5 * jnp.exp(log_density).reshape(1, 1, LAYERS)
-        return eqx.tree_at(lambda s: s.canopy.voxels.leaf, scene, extinction)
-
-    def scene(self, height, ground=0.0, slope=5.0):
-        """Scene to start a fit from: heights in m above the reference, slope in degrees."""
-        voxels = jl.VoxelMap.from_lad(
-            np.full((1, 1, LAYERS), 0.05),
-            voxel_size=(50.0, 50.0, (height - self.clearance) / LAYERS),
-            origin=(-25.0, -25.0, ground + self.clearance),
-        )
-        return jl.Scene(
-            canopy=jl.Canopy(voxels, leaf=LEAF, sides="periodic", hotspot=True),
-            ground=jl.Ground(height=ground, reflectance=GROUND, slope=slope),
-        )
-
-    def columns(self, fits, i, verdict):
-        """Columns of fit `i` of a batch: plant area, fractions of the priors, and the verdict."""
-        height, log_density = float(fits.values["canopy height"][i]), fits.values["log density"][i]
-        density = np.exp(log_density)
-        return {
-            "pai_layers": float(np.mean(density)) * (height - self.clearance),
-            "clearance": self.clearance,
-            "density": density,
-            "density_stderr": density * fits.robust_stderr["log density"][i],
-            **quality_of(fits, i, verdict),
-        }
+def columns_of_canopy(canopy, fits, i, verdict):
+    """Columns of fit `i` of a batch with a layered canopy: plant area, shares of the priors, the verdict."""
+    height, log_density = float(fits.values["canopy height"][i]), fits.values["log density"][i]
+    density = np.exp(log_density)
+    return {
+        "pai_layers": float(np.mean(density)) * (height - canopy.clearance),
+        "clearance": canopy.clearance,
+        "density": density,
+        "density_stderr": density * fits.robust_stderr["log density"][i],
+        **quality_of(fits, i, verdict),
+    }
 
 
 def quality_of(fits, i, verdict):

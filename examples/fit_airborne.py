@@ -9,7 +9,7 @@ or a number of the longest, are fitted in one batch for each kind of scene, whic
 interrupted. The script writes one row a shot to a CSV and a netCDF file, and a page with pictures of the
 best, median and worst fits. A shot that cannot be fitted has a row with the reason.
 
-A return of several echoes is fitted by ground and the canopy of `fit_gedi.py`. The unknowns are the
+A return of several echoes is fitted by ground and the canopy of the GEDI fits. The unknowns are the
 elevations of ground and top, every layer's plant area density, the gain, and the baseline of every
 digitiser; with wide footprints the slope too. A return of one echo is fitted by ground alone: its elevation,
 and by how much its echo is broader than that of flat hard ground, or the slope. The record does not show
@@ -41,11 +41,9 @@ from _airborne import (
     response_of,
 )
 from _recorded import (
-    GROUND,
-    LAYERS,
     QUALITIES,
-    LayeredCanopy,
     bad_row,
+    columns_of_canopy,
     draw_page,
     progress_bar,
     quality_of,
@@ -55,6 +53,7 @@ from _recorded import (
 import inversion
 import jaxlidar as jl
 from inversion import Recorder, Unknown, Verdict
+from inversion.scene.layered_canopy import GROUND, LAYERS, LayeredCanopy
 
 # m of height for 1 ns of two-way travel.
 METRES_PER_NS = 0.149896229
@@ -293,7 +292,7 @@ def row_of(
     else:
         row["canopy_top"] = ground + float(values["canopy height"])
         row["canopy_top_stderr"] = float(np.hypot(stderr["canopy height"], ground_stderr))
-        row |= kind.canopy.columns(batch.fits, i, verdict)
+        row |= columns_of_canopy(kind.canopy, batch.fits, i, verdict)
         top = {"canopy top": row["canopy_top"]}
     fitted = recorder.recorded(batch.fits.fitted[i, 0], values, step=record.shot.sampling_interval)
     picture = {

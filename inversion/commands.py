@@ -19,8 +19,10 @@ from inversion import demo as demonstration
 from inversion.fit.retrieval import retrieve as fit_waveform
 from inversion.fit.unknowns import Unknown
 from inversion.metrics.gedi_table import gedi_table
+from jaxlidar.cli.constants import INTERRUPTED, SUCCESS
 from jaxlidar.cli.shared import ResultPath, save_figure
 from jaxlidar.io.tables import TABLE_FORMATS
+from jaxlidar.survey.simulate_many import checkpoint_path
 
 # Seconds between lines of progress in a log file.
 _LOG_SECONDS = 5.0
@@ -162,17 +164,24 @@ def _check_table_path(ctx: Any, parameter: Any, path: Path) -> Path:
     help="Table to write: .csv, .nc, .parquet or .gpkg.",
 )
 @click.option("--group", type=click.IntRange(1, 6), default=1, help="Setting group of rh and lowest mode.")
+@click.option(
+    "--fit",
+    is_flag=True,
+    help="Also fit a canopy of layers to each shot: about two minutes, and a second for each shot.",
+)
 @click.option("--quiet", is_flag=True, help="Show no progress.")
-def gedi(files: tuple[Path, ...], out: Path, group: int, quiet: bool) -> None:
+def gedi(files: tuple[Path, ...], out: Path, group: int, fit: bool, quiet: bool) -> int:
     """Write a table of GEDI level 1B shots: ground, relative heights, cover and plant area.
 
     A row for each shot, with standard errors, quality and reasons. Shots that cannot be computed have no
-    numbers, and the reason.
+    numbers, and the reason. These are closed forms, and the first choice. With --fit there are further
+    columns, fit_...; if it is interrupted, the same command continues with the fits that have ended.
 
     \b
     Example:
       jaxlidar gedi GEDI01_B_2019108080338_O01964_T05337_02_003_01.h5 -o shots.csv
     """
+    checkpoint = checkpoint_path(out) if fit else None
     is_terminal = sys.stderr.isatty()
     last_time = time.perf_counter()
 
@@ -186,8 +195,20 @@ def gedi(files: tuple[Path, ...], out: Path, group: int, quiet: bool) -> None:
             click.echo(str(progress), err=True)
             last_time = time.perf_counter()
 
-    table = gedi_table(list(files), group=group, progress=None if quiet else report)
+    show = None if quiet else report
+    try:
+        table = gedi_table(list(files), group=group, fit=fit, path=checkpoint, progress=show)
+    except KeyboardInterrupt:
+        if checkpoint is None:
+            raise
+        message = f"finished fits are kept in {checkpoint}: the same command continues with them"
+        click.echo(f"jaxlidar: interrupted; {message}", err=True)
+        return INTERRUPTED
     table.save(out)
+    # All that it held is in the table.
+    if checkpoint is not None:
+        checkpoint.unlink(missing_ok=True)
     qualities, counts = np.unique(table["quality"], return_counts=True)
     summary = ", ".join(f"{count} {quality}" for quality, count in zip(qualities, counts))
     click.echo(f"{len(table)} shots: {summary}; written: {out}")
+    return SUCCESS

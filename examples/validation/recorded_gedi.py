@@ -12,9 +12,10 @@ import sys
 
 import numpy as np
 from _validation import COLOURS, by_quantity, comparison, finish, options
-from fit_gedi import fit_shots, pulse_of
+from fit_gedi import fit_shots
 
 import inversion
+from inversion.metrics.gedi import pulse_samples
 from jaxlidar.io import read_gedi_l1b
 
 # A bin of the record, m. The product's metrics may round to it.
@@ -50,7 +51,7 @@ def main(argv=None):
             value, reference = metrics.rh[i, level], products["rh"][i, level]
             add(f"RH{level}, product's rules", i, value, reference, bound=BIN)
         matched_ground = inversion.find_ground(
-            shot.elevation, shot.signal, pulse=pulse_of(shot), noise=shot.noise_std
+            shot.elevation, shot.signal, pulse=pulse_samples(shot), noise=shot.noise_std
         )
         add("ground, matched pulse", i, matched_ground, lowest[i], bound=2 * BIN)
     fits = fit_shots(shots)[0] if arguments.shots else []

@@ -3,8 +3,8 @@
     python examples/validation/recorded_lvis.py PLS [--out figures] [--shots 40]
 
 PLS is a PulseWaves file (.pls beside .wvs). `--shots` shots that do not saturate, evenly spread, are fitted
-by ten layers of leaves over a slope, as in `examples/fit_gedi.py`, with the outgoing pulse of each shot,
-starting from the ground of the matched pulse (`find_ground`). The geometry is checked too: the distance
+by ten layers of leaves over a slope, as in `inversion.metrics.gedi_fit`, with the outgoing pulse of each
+shot, starting from the ground of the matched pulse (`find_ground`). The geometry is checked too: the distance
 between positions of samples, 2 ns apart, against the speed of light. The two digitisers, which record odd and
 even samples, have pedestals of their own.
 """
@@ -14,10 +14,10 @@ import sys
 import jax
 import numpy as np
 from _validation import COLOURS, comparison, finish, options
-from fit_gedi import CANOPY, UNKNOWNS
 
 import inversion
 import jaxlidar as jl
+from inversion.metrics.gedi_fit import CANOPY, UNKNOWNS
 from jaxlidar.io import read_pulsewaves
 
 STEP, SATURATED, QUIET = 2.0, 215.0, 60

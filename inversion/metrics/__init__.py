@@ -1,1 +1,4 @@
-"""Metrics of waveforms without a model of the scene: ground, heights, cover, echoes, photon heights."""
+"""Metrics of waveforms, most of them without a model of the scene.
+
+Ground, heights, cover, echoes, photon heights, and tables of GEDI shots with optional fits.
+"""

@@ -41,6 +41,8 @@ _SUBDIVISIONS, _CUT, _CHUNK = 4, 2.5, 64
 # Half the lags of the longest kernel of the published settings.
 _HALF_LAGS = 65
 _RH_FRACTIONS = np.arange(101) / 100
+# Lags in ns of the pulse about its time zero.
+_LAGS = np.arange(-64.0, 65.0)
 # What is used of a shot.
 _SHOT_FIELDS = ("elevation", "waveform", "noise_mean", "noise_std")
 
@@ -278,6 +280,11 @@ def record_above_noise(shot: Any) -> np.ndarray:
     above_noise = record - float(shot.noise_mean)
     refuse_baseline("waveform less noise_mean", above_noise, np.asarray(shot.noise_std, float))
     return above_noise
+
+
+def pulse_samples(shot: Any) -> Float[np.ndarray, " lags"]:
+    """Transmitted pulse of a shot at whole ns from its time zero."""
+    return np.interp(_LAGS, shot.pulse_time, shot.pulse_power, left=0.0, right=0.0)
 
 
 def _smoothing_kernel(width: float) -> np.ndarray:

@@ -1,5 +1,7 @@
 r"""One row of each GEDI shot: ground, relative heights, cover and plant area in closed form, with errors.
 
+Optionally the row also has the fit of a layered canopy, by `gedi_fit.py`, under names of its own.
+
 **Ground.** The matched mode of `find_ground`. Noise of standard deviation s, correlated over the receiver's
 smoothing of r samples, moves the mode of a record that is smoothed by a Gaussian of k samples: with w^2 = r^2
 + k^2 and c the curvature of the smoothed record at its mode,
@@ -33,17 +35,28 @@ import numpy as np
 from jaxtyping import ArrayLike, Float
 
 from inversion.fit.quality import Verdict, judge_record
+from inversion.fit.retrieval_many import RetrievalProgress
 from inversion.metrics.cover import ground_and_canopy, plant_area_profile
 from inversion.metrics.gedi import (
     gedi_settings,
     list_of_shots,
     metrics_of_records,
     pad_shots,
+    pulse_samples,
     record_above_noise,
 )
+from inversion.metrics.gedi_fit import CANOPY, ESTIMATES, LAYER_ESTIMATES, fit_gedi_shots
 from inversion.metrics.heights import find_ground, signal_ends
 from inversion.metrics.records import size_bucket
-from jaxlidar.extend import as_numpy, check_integer, check_number, check_range, even_step
+from inversion.scene.layered_canopy import LAYERS, REFLECTANCE_RATIO
+from jaxlidar.extend import (
+    as_numpy,
+    check_integer,
+    check_kind,
+    check_number,
+    check_range,
+    even_step,
+)
 from jaxlidar.io import Column, ColumnAxis, GediShot, ShotTable
 from jaxlidar.io.gedi import IncompleteShot, read_gedi_rows
 
@@ -53,8 +66,6 @@ _GROUPS, _BATCH = range(1, 7), 64
 _STRICT_GROUPS = (1, 3, 4, 6)
 # Fewest samples of a record.
 _MIN_SAMPLES = 5
-# Lags in ns of the pulse about its time zero.
-_LAGS = np.arange(-64.0, 65.0)
 # Receiver's smoothing r in samples, and the sum of the noise's autocorrelation that follows, 2 sqrt(pi) r.
 _NOISE_WIDTH = 1.7
 _CORRELATION_SUM = 2.0 * np.sqrt(np.pi) * _NOISE_WIDTH
@@ -81,8 +92,9 @@ _RH_AXIS = ColumnAxis("percentile", np.arange(101.0), "percent")
 class TableProgress(NamedTuple):
     """Progress of `gedi_table`, which calls its argument `progress` with it. Printed, it is one line.
 
-    - `done`, `total`: number of shots.
+    - `done`, `total`: number of shots, or of fits.
     - `seconds`: time elapsed.
+    - `stage`: "shots" while closed forms are computed, then "fits" if there are any. Default "shots".
 
     **Example:**
 
@@ -94,9 +106,10 @@ class TableProgress(NamedTuple):
     done: int
     total: int
     seconds: float
+    stage: str = "shots"
 
     def __str__(self) -> str:
-        return f"{self.done} of {self.total} shots, {self.seconds:.1f} s"
+        return f"{self.done} of {self.total} {self.stage}, {self.seconds:.1f} s"
 
 
 def gedi_table(
@@ -107,6 +120,8 @@ def gedi_table(
     reflectance_ratio: float = 1.5,
     projection: float = 0.5,
     clumping: float = 1.0,
+    fit: bool = False,
+    path: str | os.PathLike[str] | None = None,
     progress: Callable[[TableProgress], Any] | None = None,
 ) -> ShotTable:
     """Return a table of GEDI shots: ground, relative heights, cover and plant area, with standard errors.
@@ -125,7 +140,10 @@ def gedi_table(
     - `reflectance_ratio`: of plants over ground, above 0. Default 1.5, level 2B's.
     - `projection`: of plant area, as for `plant_area_index`. Default 0.5.
     - `clumping`: index of clumping, as for `plant_area_index`. Default 1.
-    - `progress`: called with a `TableProgress` after each batch of shots. Default None.
+    - `fit`: also fit a layered canopy over sloping ground to each shot, see below. Default False.
+    - `path`: a checkpoint that stores every fit once it has ended, as for `inversion.retrieve_many`: the same
+      call continues with it. Default None: no file.
+    - `progress`: called with a `TableProgress` after each batch of shots, and after each fit. Default None.
 
     **Returns:** a `jaxlidar.io.ShotTable`, a row for each shot in their order, with
 
@@ -135,12 +153,34 @@ def gedi_table(
     - `elev_lowestmode`, `elev_highestreturn`, `num_detectedmodes`, `rh` (shots, 101), `rh_stderr` of setting
       group `group`, and `elev_lowestmode_a1` ... `rh_a6` of all groups, by the rules of level 2A;
     - `cover`, `pai`, `plant_area_density` (shots, layers), each with `..._stderr`;
-    - `quality`: "good", "doubtful" or "bad", and `reasons`.
+    - `quality`: "good", "doubtful" or "bad", and `reasons`;
+    - with `fit`, the columns `fit_...`, described below.
+
+    **Fits.** The scene, its unknowns and what is fixed are those of `inversion.metrics.gedi_fit`; `edges`,
+    `reflectance_ratio`, `projection` and `clumping` do not act on it. The columns are
+
+    - `fit_ground`, `fit_canopy_top`, `fit_slope`, `fit_pai` (of the layers), and `fit_plant_area_density`
+      (shots, 10) of ten layers of equal thickness from 1 m above `fit_ground` to `fit_canopy_top`, each with
+      `..._stderr`, the robust standard error of the fit with nothing added;
+    - `fit_reduced_chi2`;
+    - `fit_quality` and `fit_reasons`: of record and fit, about the ground. A shot that cannot be fitted is
+      bad and has NaN.
+
+    They compile for one to two minutes, and then take about a second of one core each.
+
+    The closed forms are the first choice. Of 60 recorded shots of a savanna, the fits of 44 are good and of
+    none bad. Their ground is low, by 0.09 m from the product's in the median and by 0.32 m or more in a tenth
+    of the good shots; `ground` is within 0.02 m in the median and 0.08 m in all. The likely cause is relief:
+    it gives the ground's echo shoulders, which a plane under plants explains by low plants, with the ground
+    below them. Two standard errors hold the product's ground in 84 % of the good shots. `fit_pai` ranks
+    plant area by 0.39 as the product does, where `pai` has 0.90. `fit_canopy_top` lies up to some metres
+    above the plants where the uppermost layers are all but empty, which its standard error does not tell.
 
     **Warns:** `jaxlidar.io.FileWarning` for beams that cannot be read.
 
     **Raises:** TypeError for things that are neither paths nor shots. FileNotFoundError, and ValueError for
-    files that are not GEDI L1B; ValueError for numbers outside their ranges. Never for a single shot.
+    files that are not GEDI L1B; ValueError for numbers outside their ranges, and for a `path` without `fit`.
+    What `inversion.retrieve_many` raises for `path`. Never for a single shot.
 
     **Source:** Hofton and Blair (2019) and Tang and Armston (2019), GEDI theoretical basis documents; Hancock
     et al. (2019), Earth Space Sci. 6, 294, for the sensitivity.
@@ -167,6 +207,10 @@ def gedi_table(
     check_range("edges", layer_edges)
     if layer_edges.ndim != 1 or layer_edges.size < 2 or not np.all(np.diff(layer_edges) > 0):
         raise ValueError(f"edges = {edges}; admissible are two heights or more, increasing")
+    check_kind("fit", fit, bool | np.bool_, "True or False")
+    check_kind("path", path, str | os.PathLike | None, "a path, or None")
+    if path is not None and not fit:
+        raise ValueError(f"path = {os.fspath(path)!r} is the checkpoint of fits: it needs fit=True")
     start_time = time.perf_counter()
     rows = _rows_of(shots)
     refusals = [_refusal(row) for row in rows]
@@ -185,7 +229,16 @@ def gedi_table(
             seconds = time.perf_counter() - start_time
             progress(TableProgress(int(first + batch.size), int(usable.size), seconds))
     verdicts = [_verdict_after(verdict, estimates, i) for i, verdict in enumerate(verdicts)]
-    return _table(rows, estimates, verdicts, group, structure)
+    table = _table(rows, estimates, verdicts, group, structure)
+    if not fit:
+        return table
+
+    def report(fits: RetrievalProgress) -> None:
+        if progress is not None:
+            progress(TableProgress(fits.done, fits.total, time.perf_counter() - start_time, "fits"))
+
+    columns, attributes = _fit_columns(rows, estimates, verdicts, path, report)
+    return ShotTable(table.columns | columns, table.attributes | attributes)
 
 
 # -- shots and verdicts ------------------------------------------------------------------------------------
@@ -218,7 +271,7 @@ def _refusal(shot: Any) -> str | None:
         check_integer("number of samples", shot.waveform.size, _MIN_SAMPLES)
         even_step("elevation", shot.elevation, decreasing=True)
         check_number("noise_std", shot.noise_std, 0.0, low_open=True)
-        power = _pulse_samples(shot)
+        power = pulse_samples(shot)
         check_range("pulse_power", power)
         check_number("largest pulse_power", power.max(), 0.0, low_open=True)
         check_number("zenith", shot.zenith, 0.0, 90.0, high_open=True)
@@ -234,7 +287,7 @@ def _verdict_before(row: Any, refusal: str | None) -> Verdict:
     return judge_record(
         row.waveform - row.noise_mean,
         noise=row.noise_std,
-        pulse=_pulse_samples(row),
+        pulse=pulse_samples(row),
         degrade=getattr(row, "degrade", None),
         stale_return=getattr(row, "stale_return", None),
     )
@@ -257,11 +310,6 @@ def _verdict_after(verdict: Verdict, estimates: dict[str, np.ndarray], i: int) -
     if spread > _AMBIGUOUS_GROUND:
         verdict &= Verdict("doubtful", (f"ground: setting groups differ by {spread:.1f} m",))
     return verdict
-
-
-def _pulse_samples(shot: Any) -> Float[np.ndarray, " lags"]:
-    """Return the transmitted pulse at whole ns from its time zero."""
-    return np.interp(_LAGS, shot.pulse_time, shot.pulse_power, left=0.0, right=0.0)
 
 
 # -- estimates ---------------------------------------------------------------------------------------------
@@ -305,7 +353,7 @@ def _estimate(
     # Heights over the first sample: elevations lose 0.1 mm to 1 mm in single precision.
     height = -step[:, None] * np.arange(padded_size)
     noise_std = np.array([float(shot.noise_std) for shot in filled])
-    pulse = np.stack([_pulse_samples(shot) for shot in filled])
+    pulse = np.stack([pulse_samples(shot) for shot in filled])
 
     padded = pad_shots(filled, size=padded_size, is_checked=True)
     estimates: dict[str, np.ndarray] = {}
@@ -550,8 +598,7 @@ def _table(
         "longitude": Column(optional("longitude"), "degrees", "of the last bin"),
     }
     columns |= {name: Column(optional(name), *text) for name, text in _OPTIONAL.items()}
-    columns["quality"] = Column(np.array([v.quality for v in verdicts], str), "", "good, doubtful or bad")
-    columns["reasons"] = Column(np.array(["; ".join(v.reasons) for v in verdicts], str), "", "of the quality")
+    columns["quality"], columns["reasons"] = _verdict_columns(verdicts)
     columns |= {name: Column(estimates[name], *text) for name, text in _ESTIMATES.items()}
     columns["rh"] = Column(estimates["rh"], "m", f"relative height of setting group {group}", _RH_AXIS)
     columns["rh_stderr"] = Column(estimates["rh_stderr"], "m", "standard error of rh", _RH_AXIS)
@@ -573,3 +620,50 @@ def _table(
         "setting_group": f"{group}",
     }
     return ShotTable(columns, attributes)
+
+
+def _fit_columns(
+    rows: list[Any],
+    estimates: dict[str, np.ndarray],
+    verdicts: list[Verdict],
+    path: str | os.PathLike[str] | None,
+    progress: Callable[[RetrievalProgress], None],
+) -> tuple[dict[str, Column], dict[str, str]]:
+    """Return the columns of fits, and the attributes that describe them.
+
+    **Arguments:** `verdicts`: of the closed forms, which say why shots without a ground have none.
+    """
+    (with_ground,) = np.nonzero(np.isfinite(estimates["ground"]))
+    fits = fit_gedi_shots(
+        [rows[i] for i in with_ground],
+        estimates["ground"][with_ground],
+        estimates["elev_lowestmode_a1"][with_ground],
+        path=path,
+        progress=progress,
+    )
+    fit_verdicts = list(verdicts)
+    for i, verdict in zip(with_ground, fits.verdicts):
+        fit_verdicts[i] = verdict
+    layers = ColumnAxis("fit_layer", np.arange(1.0, LAYERS + 1.0))
+    columns = {}
+    for name, (unit, text) in (ESTIMATES | LAYER_ESTIMATES).items():
+        fitted = fits.estimates[name]
+        values = np.full((len(rows), *fitted.shape[1:]), np.nan)
+        values[with_ground] = fitted
+        axis = layers if name in LAYER_ESTIMATES else None
+        columns[f"fit_{name}"] = Column(values, unit, f"fit: {text}", axis)
+    for name, text in zip(("quality", "reasons"), _verdict_columns(fit_verdicts)):
+        columns[f"fit_{name}"] = text._replace(description=f"fit: {text.description}")
+    attributes = {
+        "title": "GEDI shots: ground, relative heights, cover and plant area in closed form, and fits",
+        "fit_layers": f"{LAYERS} from {CANOPY.clearance:g} m above fit_ground to fit_canopy_top",
+        "fit_reflectance_ratio": f"{REFLECTANCE_RATIO:g}",
+    }
+    return columns, attributes
+
+
+def _verdict_columns(verdicts: list[Verdict]) -> tuple[Column, Column]:
+    """Return the columns of qualities and of reasons."""
+    qualities = np.array([v.quality for v in verdicts], str)
+    reasons = np.array(["; ".join(v.reasons) for v in verdicts], str)
+    return Column(qualities, "", "good, doubtful or bad"), Column(reasons, "", "of the quality")

@@ -5,6 +5,7 @@ import pytest
 
 import inversion
 from inversion.metrics import gedi_table as module
+from inversion.metrics.gedi import pulse_samples
 from jaxlidar.io import GediShot, read_gedi_l1b
 
 LAG = np.arange(-40.0, 41.0)
@@ -91,7 +92,7 @@ def test_standard_errors_contain_the_scatter_of_noise(noisy, monkeypatch):
     records = np.stack([shot(i, random=np.random.default_rng(i)).waveform - 200.0 for i in range(200)])
     height = np.broadcast_to(-STEP * np.arange(900), records.shape)
     ground = np.asarray(inversion.find_ground(height, records, pulse=PULSE, noise=3.0), float)
-    pulse = np.tile(np.interp(module._LAGS, LAG, PULSE, left=0.0, right=0.0), (200, 1))
+    pulse = np.tile(pulse_samples(shot()), (200, 1))
     noise = np.full(200, 3.0 * np.sqrt(1 / (2 * np.sqrt(np.pi) * 1.7)))
     stderr = module._ground_stderr(records, np.full(200, STEP), ground, pulse, noise)
     assert ground.std() == pytest.approx(np.median(stderr), rel=0.25)
@@ -136,6 +137,9 @@ def test_shots_of_any_length_share_programs_and_one_bad_shot_does_no_harm():
         ({"shots": [], "group": 7}, ValueError, "group = 7"),
         ({"shots": [], "edges": [5.0, 0.0]}, ValueError, "edges = .*increasing"),
         ({"shots": [], "projection": 0.0}, ValueError, "projection = 0"),
+        ({"shots": [], "fit": "yes"}, TypeError, "fit"),
+        ({"shots": [], "fit": True, "path": 3}, TypeError, "path"),
+        ({"shots": [], "path": "fits.sqlite"}, ValueError, "fits.sqlite.*fit=True"),
     ],
 )
 def test_inadmissible_arguments_are_refused(arguments, error, message):
