@@ -69,7 +69,7 @@ _SIGNAL_SIGMAS, _TOP_ECHO, _START_HEIGHTS = 3.0, 2.0, (2.0, 38.0)
 # Two estimates of the ground further apart than this are both tried, m. If the reduced chi-squared of the two
 # fits differ by less than a factor, the ground is ambiguous.
 _AMBIGUOUS_GROUND, _CHI2_FACTOR = 0.5, 2.0
-# A fitted ground further than this from the matched mode is doubtful, m.
+# A fitted ground further than this from the mode that it started from is doubtful, m.
 _DOUBTFUL_DISTANCE = 0.5
 # Bounds of the gain: fractions of the signal over an apparent reflectance.
 _GAINS = (0.0, 20.0)
@@ -222,7 +222,7 @@ def fit_gedi_shots(
                 verdict &= Verdict("doubtful", (f"second minimum: {reason}",))
         distance = fits.estimates["ground"][i] - prepared[best].ground
         if abs(distance) > _DOUBTFUL_DISTANCE:
-            verdict &= Verdict("doubtful", (f"ground {distance:+.2f} m from the matched mode",))
+            verdict &= Verdict("doubtful", (f"ground {distance:+.2f} m from the mode it started from",))
         verdicts.append(verdict)
     return fits._replace(verdicts=tuple(verdicts))
 
