@@ -30,6 +30,7 @@ def extinction():
     return jnp.asarray(np.random.default_rng(0).uniform(0, 0.6, (4, 4, 4)), jnp.zeros(()).dtype)
 
 
+@pytest.mark.slow
 def test_a_flight_in_one_function_is_the_same(extinction):
     plain, marked = (jax.jit(lambda k, r=r: flight(k, reverse=r))(extinction) for r in (True, False))
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-6), plain, marked)

@@ -240,7 +240,13 @@ def derivative_programs(shape):
 
 @pytest.mark.parametrize(
     ("shape", "decay"),
-    [("Gaussian", 1.3), ("rectangle", 1.3), ("exponential", 1.3), ("exponential", 0.013), ("sampled", 1.3)],
+    [
+        ("Gaussian", 1.3),
+        pytest.param("rectangle", 1.3, marks=pytest.mark.slow),
+        pytest.param("exponential", 1.3, marks=pytest.mark.slow),
+        ("exponential", 0.013),
+        pytest.param("sampled", 1.3, marks=pytest.mark.slow),
+    ],
 )
 def test_derivatives_match_central_differences(shape, decay):
     with jax.enable_x64(True):

@@ -66,6 +66,7 @@ def same_voxels(voxels, expected):
     return bool(eqx.tree_equal(voxels, expected))
 
 
+@pytest.mark.slow
 def test_a_forest_stands_on_an_elevation_model(folder):
     text = f"""[scene.ground]
     kind = "read_dem"

@@ -446,7 +446,7 @@ FAMILIES = {
         jl.EqualAngle, answers.equal_angle, (1e-5, 1e-9), (1e-4, 1e-9), DOUBLE_PRECISION
     ),
     "mirror": law_family(jl.Specular, answers.mirror, (1e-5, 1e-6), (1e-4, 1e-4), DOUBLE_PRECISION),
-    "slab": slab_family(hotspot=False, slow=DOUBLE_PRECISION),
+    "slab": slab_family(hotspot=False, slow=BOTH_PRECISIONS),
     "slab, hot spot": slab_family(hotspot=True, slow=BOTH_PRECISIONS),
     "one voxel of 1 mm": one_voxel_family(1e-3, 1000.0),
     "one voxel of 1 km": one_voxel_family(1e3, 20000.0),

@@ -107,7 +107,11 @@ def shots_of_a_tripod() -> jl.Survey:
     return jl.Survey(lidar, sensor=sensors, zenith=[95.0, 100.0, 80.0], azimuth=90.0)
 
 
-@pytest.mark.parametrize("shots_of", [lambda: narrow_shots(3), shots_of_a_tripod], ids=["above", "tripod"])
+@pytest.mark.parametrize(
+    "shots_of",
+    [lambda: narrow_shots(3), pytest.param(shots_of_a_tripod, marks=pytest.mark.slow)],
+    ids=["above", "tripod"],
+)
 @BY_PRECISION
 def test_parts_of_many_shots_are_those_of_single_ones(precision, shots_of):
     """Lattices that are traced together return what each returns alone; planted: that of another shot."""

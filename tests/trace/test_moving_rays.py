@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 
 import jaxlidar as jl
-from tests.helpers import slow_unless
 
 KEYS, STEPS = 6, {"divergence": 0.1, "position": 0.1, "map": 0.1, "size": 0.05, "relief": 0.05}
 START = {"divergence": 2.0, "position": 0.0, "map": 0.0, "size": 1.0, "relief": 1.0}
@@ -70,7 +69,8 @@ def derivatives(case):
     return exact, (sides[1] - sides[0]) / (2 * step)
 
 
-@pytest.mark.parametrize(("zenith", "has_canopy", "has_terrain", "name"), slow_unless(CASES[:1], CASES))
+@pytest.mark.slow
+@pytest.mark.parametrize(("zenith", "has_canopy", "has_terrain", "name"), CASES)
 def test_derivatives_agree_with_differences(zenith, has_canopy, has_terrain, name):
     exact, difference = derivatives((zenith, has_canopy, has_terrain, name))
     # Keys are the same on both sides.

@@ -113,7 +113,7 @@ def first_order(shape, **changes):
     [
         ((1, 1, 1), {"max_step": 1.3}),
         ((40, 31, 7), {}),
-        ((2, 3, 20), {"bin_width": 0.05}),
+        pytest.param((2, 3, 20), {"bin_width": 0.05}, marks=pytest.mark.slow),
     ],
 )
 def test_steps_voxels_and_fine_bins_do_not_change_the_waveform(reference, shape, changes):

@@ -158,6 +158,7 @@ def test_vectors_end_at_the_minimum_within_their_bounds():
 # -- evaluations
 
 
+@pytest.mark.slow
 def test_a_fit_without_random_numbers_requests_no_evaluation_twice(monkeypatch):
     requested = []
     evaluate = LockstepModel.__call__

@@ -111,6 +111,7 @@ def test_a_slope_tells_how_far_up_it_a_footprint_lies():
     assert not error[1] < 100 * error[0]
 
 
+@pytest.mark.slow
 def test_a_bound_at_nadir_is_that_of_a_beam_beside_it():
     """A start on a bound moves by 1 % of the width, to 0.09 degrees. A plan for nadir does not serve it."""
     nadir = dataclasses.replace(LIDAR, zenith=0.0, azimuth=90.0)
@@ -127,6 +128,7 @@ def test_a_bound_at_nadir_is_that_of_a_beam_beside_it():
         inversion.cramer_rao(nadir, SCENE, [zenith], noise=1e-3, key=jax.random.key(0), plan=plan)
 
 
+@pytest.mark.slow
 def test_posterior_and_profile_know_the_lidar():
     """The gradient of a log-density is its difference, and a profile's minimum is at the truth."""
     truth = dataclasses.replace(LIDAR, pulse=jl.GaussianPulse(4.0))

@@ -350,6 +350,7 @@ def test_a_step_to_a_simulation_that_is_not_finite_is_rejected():
     assert 0.5 < float(fit.values["factor"]) <= 0.9
 
 
+@pytest.mark.slow
 def test_starts_and_photons_have_different_keys(monkeypatch):
     """Latin hypercubes of one fit and of many are drawn with keys of no batch of photons."""
     keys = []

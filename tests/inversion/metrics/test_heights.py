@@ -127,6 +127,7 @@ def test_the_ground_is_split_from_the_canopy(fraction, precision):
     assert float(plant_area_index(split.gap)) == pytest.approx(-2 * np.log(1 - cover), rel=0.2)
 
 
+@pytest.mark.slow
 def test_derivatives_are_those_of_differences():
     with jax.enable_x64(True):
         power = jnp.asarray(noisy(echoes((60.0, 15.0), (100.0, 0.0)), 1.0, 3))
