@@ -172,7 +172,7 @@ import resource, sys
 import jax, numpy as np
 import jaxlidar as jl
 voxels = jl.VoxelMap.from_extinction(leaf=np.ones((1, 1, 1)), voxel_size=10.0, origin=(-5.0, -5.0, 0.0))
-canopy = jl.Canopy(voxels, leaf=jl.Isotropic(albedo=1.0), sides="periodic")
+canopy = jl.Canopy(voxels, leaf=jl.Isotropic(albedo=1.0), sides="periodic", hotspot=False)
 scene = jl.Scene(canopy=canopy, ground=jl.Ground(reflectance=0.2))
 lidar = jl.Lidar(altitude=4e5, divergence=1e-3)
 settings = {"window": (-81.0, 3000.0), "max_orders": 300, "n_photons": 1 << 17}
