@@ -26,7 +26,7 @@ FlatMap = Callable[[list[Array], list[Array]], Sequence[Array]]
 def linear_map(
     function: FlatMap,
     transpose: FlatMap,
-    residuals: Sequence[Array],
+    residuals: Sequence[Any],
     arguments: Sequence[Array],
     results: Sequence[Any],
 ) -> list[Array]:
@@ -37,7 +37,8 @@ def linear_map(
     - `function`: linear in the arguments. `transpose`: its transpose, which returns a cotangent for each
       argument. Neither may use traced values other than its arguments, and both must have forward derivatives
       by the residuals, if second derivatives are taken.
-    - `residuals`: arrays on which both depend. `arguments`: arrays of real numbers.
+    - `residuals`: arrays on which both depend, or the numbers by which JAX replaces them where they are
+      constants of a program. `arguments`: arrays of real numbers.
     - `results`: arrays, or types of arrays, of the shapes and types of the results. So the function that is
       not used, here or in the transpose, need not be traced.
     """
