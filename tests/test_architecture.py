@@ -323,9 +323,11 @@ def test_the_core_neither_plots_nor_prints():
 
 
 def test_importing_leaves_the_configuration_alone():
+    """No array is made either: it would start a backend, whose options could not be chosen any more."""
     code = (
         "import jax; before = dict(jax.config.values); import jaxlidar, inversion; "
-        "assert all(jax.config.values[k] == v for k, v in before.items())"
+        "assert all(jax.config.values[k] == v for k, v in before.items()); "
+        "from jax._src import xla_bridge; assert not xla_bridge.backends_are_initialized()"
     )
     subprocess.run([sys.executable, "-c", code], check=True, cwd=ROOT)
 

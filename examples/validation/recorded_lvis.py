@@ -17,7 +17,7 @@ from _validation import COLOURS, comparison, finish, options
 
 import inversion
 import jaxlidar as jl
-from inversion.metrics.gedi_fit import CANOPY, UNKNOWNS
+from inversion.metrics.gedi_fit import CANOPY, canopy_unknowns
 from jaxlidar.io import read_pulsewaves
 
 STEP, SATURATED, QUIET = 2.0, 215.0, 60
@@ -63,7 +63,7 @@ def fit_canopies(shots, signals, noise, middle):
         np.where(outside, 0.0, power)[:, None],
         [lidar_of(pulse) for pulse in pulses],
         CANOPY.scene(10.0),
-        UNKNOWNS,
+        canopy_unknowns(),
         noise=sigma[:, None],
         time=TIME,
         key=jax.random.key(0),

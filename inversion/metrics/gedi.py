@@ -33,6 +33,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int
 
+from inversion.fit.quality import Verdict, judge_record
 from inversion.metrics.records import refuse_baseline, size_bucket
 from jaxlidar.extend import as_numpy, check_integer, check_number, check_range, even_step
 
@@ -41,6 +42,9 @@ _SUBDIVISIONS, _CUT, _CHUNK = 4, 2.5, 64
 # Half the lags of the longest kernel of the published settings.
 _HALF_LAGS = 65
 _RH_FRACTIONS = np.arange(101) / 100
+# Records are smoothed by the receiver as by a Gaussian of this standard deviation, ns or samples; the
+# transmitted pulse is not.
+RECEIVER_SMOOTHING = 1.7
 # Lags in ns of the pulse about its time zero.
 _LAGS = np.arange(-64.0, 65.0)
 # What is used of a shot.
@@ -283,8 +287,19 @@ def record_above_noise(shot: Any) -> np.ndarray:
 
 
 def pulse_samples(shot: Any) -> Float[np.ndarray, " lags"]:
-    """Transmitted pulse of a shot at whole ns from its time zero."""
+    """Return the transmitted pulse of a shot at whole ns from its time zero."""
     return np.interp(_LAGS, shot.pulse_time, shot.pulse_power, left=0.0, right=0.0)
+
+
+def judge_shot(shot: Any) -> Verdict:
+    """Return the verdict on the record of a shot."""
+    return judge_record(
+        shot.waveform - shot.noise_mean,
+        noise=shot.noise_std,
+        pulse=pulse_samples(shot),
+        degrade=getattr(shot, "degrade", None),
+        stale_return=getattr(shot, "stale_return", None),
+    )
 
 
 def _smoothing_kernel(width: float) -> np.ndarray:

@@ -27,33 +27,19 @@ import numpy as np
 from jaxtyping import Float, Int
 
 import jaxlidar as jl
-from inversion.fit.quality import Verdict, judge_fits, judge_record
+from inversion.fit.quality import Verdict, judge_fits
 from inversion.fit.result import Retrievals
 from inversion.fit.retrieval_many import RetrievalProgress, retrieve_many
 from inversion.fit.uncertainty import correlation_of
 from inversion.fit.unknowns import Unknown
-from inversion.metrics.gedi import pulse_samples
+from inversion.metrics.gedi import RECEIVER_SMOOTHING, judge_shot
 from inversion.scene.layered_canopy import LAYERS, LayeredCanopy
 
 CANOPY = LayeredCanopy(clearance=1.0)
-UNKNOWNS = [
-    Unknown(name="ground", bounds=(-1.0, 1.0), prior=(0.0, 0.1), start=0.0, apply=CANOPY.put_ground),
-    Unknown(name="canopy height", bounds=(1.5, 45.0), start=8.0, apply=CANOPY.put_height),
-    Unknown("ground.slope", bounds=(0.0, 30.0), name="slope", prior=(0.0, 15.0)),
-    Unknown(
-        name="log density",
-        bounds=(np.log(1e-5), np.log(3.0)),
-        prior=(np.log(0.01), 1.5),
-        start=np.full(LAYERS, np.log(0.02)),
-        apply=CANOPY.put_density,
-    ),
-]
 # Orbit, m, and the diameter of the footprint at 1/e^2, m.
 _ALTITUDE, _FOOTPRINT, _APERTURE = 400e3, 25.0, 0.8
 # Samples above and below the reference: of 1 ns, or 0.15 m.
 _ABOVE, _BELOW = 280, 80
-# Records are smoothed as by a Gaussian of this standard deviation, ns; the transmitted pulse is not.
-_SMOOTHING = 1.7
 # Noise is correlated over five neighbouring samples: together they have the information of one.
 _CORRELATED = 5
 # The receiver has a tail that the transmitted pulse does not show: samples further than this below the
@@ -118,8 +104,27 @@ def lidar_of(pulse: Any) -> jl.Lidar:
     """Return GEDI with the transmitted pulse of a shot."""
     divergence = _FOOTPRINT / _ALTITUDE * 1e3
     return jl.Lidar(
-        altitude=_ALTITUDE, divergence=divergence, aperture=_APERTURE, pulse=pulse, jitter=_SMOOTHING
+        altitude=_ALTITUDE, divergence=divergence, aperture=_APERTURE, pulse=pulse, jitter=RECEIVER_SMOOTHING
     )
+
+
+def canopy_unknowns() -> list[Unknown]:
+    """Return the unknowns of a fit: heights in m, the slope in degrees, log densities of the layers.
+
+    Not a constant: its arrays would start JAX when the package is imported.
+    """
+    return [
+        Unknown(name="ground", bounds=(-1.0, 1.0), prior=(0.0, 0.1), start=0.0, apply=CANOPY.put_ground),
+        Unknown(name="canopy height", bounds=(1.5, 45.0), start=8.0, apply=CANOPY.put_height),
+        Unknown("ground.slope", bounds=(0.0, 30.0), name="slope", prior=(0.0, 15.0)),
+        Unknown(
+            name="log density",
+            bounds=(np.log(1e-5), np.log(3.0)),
+            prior=(np.log(0.01), 1.5),
+            start=np.full(LAYERS, np.log(0.02)),
+            apply=CANOPY.put_density,
+        ),
+    ]
 
 
 class PreparedShot:
@@ -215,7 +220,7 @@ def fit_gedi_shots(
             numbers, key=lambda n: (not retrievals.converged[n], retrievals.reduced_chi2[n])
         )
         _store(fits, i, prepared[best], retrievals, best)
-        verdict = _judge_shot(shot) & fit_verdicts[best]
+        verdict = judge_shot(shot) & fit_verdicts[best]
         for n in alternatives:
             if retrievals.reduced_chi2[n] < _CHI2_FACTOR * retrievals.reduced_chi2[best]:
                 reason = f"ground at {prepared[n].ground:.1f} m fits nearly as well"
@@ -234,17 +239,6 @@ def _prepare(shot: Any, ground: float, lowest_mode: float) -> list[PreparedShot]
     # Refuses pulses that no lidar has.
     jl.SampledPulse(time=shot.pulse_time, power=shot.pulse_power)
     return [PreparedShot(shot, elevation) for elevation in start_grounds(ground, lowest_mode)]
-
-
-def _judge_shot(shot: Any) -> Verdict:
-    """Return the verdict on a record."""
-    return judge_record(
-        shot.waveform - shot.noise_mean,
-        noise=shot.noise_std,
-        pulse=pulse_samples(shot),
-        degrade=getattr(shot, "degrade", None),
-        stale_return=getattr(shot, "stale_return", None),
-    )
 
 
 def _fit(
@@ -268,7 +262,7 @@ def _fit(
         np.stack([p.signal for p in prepared])[:, None],
         [lidar_of(_padded_pulse(p.shot, size)) for p in prepared],
         CANOPY.scene(10.0),
-        UNKNOWNS,
+        canopy_unknowns(),
         noise=np.stack([p.noise for p in prepared])[:, None],
         time=np.arange(-_ABOVE, _BELOW + 1),
         key=jax.random.key(0),

@@ -34,11 +34,13 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import ArrayLike, Float
 
-from inversion.fit.quality import Verdict, judge_record
+from inversion.fit.quality import Verdict
 from inversion.fit.retrieval_many import RetrievalProgress
 from inversion.metrics.cover import ground_and_canopy, plant_area_profile
 from inversion.metrics.gedi import (
+    RECEIVER_SMOOTHING,
     gedi_settings,
+    judge_shot,
     list_of_shots,
     metrics_of_records,
     pad_shots,
@@ -66,9 +68,8 @@ _GROUPS, _BATCH = range(1, 7), 64
 _STRICT_GROUPS = (1, 3, 4, 6)
 # Fewest samples of a record.
 _MIN_SAMPLES = 5
-# Receiver's smoothing r in samples, and the sum of the noise's autocorrelation that follows, 2 sqrt(pi) r.
-_NOISE_WIDTH = 1.7
-_CORRELATION_SUM = 2.0 * np.sqrt(np.pi) * _NOISE_WIDTH
+# Sum of the noise's autocorrelation, 2 sqrt(pi) r with the receiver's smoothing r.
+_CORRELATION_SUM = 2.0 * np.sqrt(np.pi) * RECEIVER_SMOOTHING
 # Fewest samples above the signal from which noise is estimated, and their distance from it in m. Where there
 # are fewer it is this fraction of the product's, which is that before smoothing.
 _MIN_QUIET, _QUIET_DISTANCE, _SMOOTHED_FRACTION = 50, 5.0, 0.41
@@ -282,15 +283,7 @@ def _refusal(shot: Any) -> str | None:
 
 def _verdict_before(row: Any, refusal: str | None) -> Verdict:
     """Return the verdict on a record."""
-    if refusal is not None:
-        return Verdict("bad", (refusal,))
-    return judge_record(
-        row.waveform - row.noise_mean,
-        noise=row.noise_std,
-        pulse=pulse_samples(row),
-        degrade=getattr(row, "degrade", None),
-        stale_return=getattr(row, "stale_return", None),
-    )
+    return judge_shot(row) if refusal is None else Verdict("bad", (refusal,))
 
 
 def _verdict_after(verdict: Verdict, estimates: dict[str, np.ndarray], i: int) -> Verdict:
@@ -417,8 +410,8 @@ def _ground_stderr(
     width = width[:, 0]
     is_peak = (curvature > 0) & (value > 0)
     safe_curvature = np.where(is_peak, curvature, np.nan)
-    total = _NOISE_WIDTH**2 + width**2
-    by_noise = noise * np.sqrt(_NOISE_WIDTH / (2.0 * total**1.5)) / safe_curvature
+    total = RECEIVER_SMOOTHING**2 + width**2
+    by_noise = noise * np.sqrt(RECEIVER_SMOOTHING / (2.0 * total**1.5)) / safe_curvature
     # A Gaussian echo has the variance of value over curvature; that of the pulse follows from its moments.
     smoothed = width**2 + _pulse_variance(pulse)
     excess = np.sqrt(np.maximum(value / safe_curvature - smoothed, 0.0))

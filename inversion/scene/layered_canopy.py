@@ -14,10 +14,11 @@ from jaxtyping import Array, Float
 import jaxlidar as jl
 
 LAYERS = 10
-# Spherically oriented leaves return two thirds of their reflectance: rho_v = 0.30. Over the ground's 0.20
-# that is the ratio of GEDI's level 2B algorithm, 0.6 / 0.4.
-LEAF, GROUND = jl.LeafOptics(reflectance=0.45, transmittance=0.40), 0.20
-REFLECTANCE_RATIO = 1.5
+# Reflectance and transmittance of leaves, and reflectance of the ground.
+_LEAF, GROUND = (0.45, 0.40), 0.20
+# Spherically oriented leaves return two thirds of their reflectance: rho_v = 0.30. Over that of the ground
+# this is the ratio of GEDI's level 2B algorithm, 0.6 / 0.4.
+REFLECTANCE_RATIO = 2.0 / 3.0 * _LEAF[0] / GROUND
 # G of spherically oriented leaves, by which extinction follows from plant area density.
 _PROJECTION = 0.5
 # Edge of the periodic scene in m: wider than a footprint.
@@ -57,6 +58,6 @@ class LayeredCanopy:
             origin=(-0.5 * _WIDTH, -0.5 * _WIDTH, ground + self.clearance),
         )
         return jl.Scene(
-            canopy=jl.Canopy(voxels, leaf=LEAF, sides="periodic", hotspot=True),
+            canopy=jl.Canopy(voxels, leaf=jl.LeafOptics(*_LEAF), sides="periodic", hotspot=True),
             ground=jl.Ground(height=ground, reflectance=GROUND, slope=slope),
         )
