@@ -129,7 +129,9 @@ def compute_labels(scene: DeviceScene, model: WaveformModel) -> Truth:
 
     1. Trace order one, for the returns of every material.
     2. March the rays of the footprint, and add up by sample: intercepted energy, areas of leaf and bark.
-    3. Gap probability is the energy that is not intercepted yet; plant area and heights follow from the sums.
+    3. Gap probability is the energy that is not intercepted yet: what passes through all, and what is
+       intercepted later. Summed from the far end, small gaps are not differences of large numbers.
+    4. Plant area and heights follow from the sums.
     """
     lidar, time = model.lidar, model.time
     # Nothing is drawn.
@@ -142,8 +144,10 @@ def compute_labels(scene: DeviceScene, model: WaveformModel) -> Truth:
     sums = _sum_rays(scene, samples, across, energy, axis_heights)
     # A traced value outside its range makes all labels NaN.
     sums = jax.tree.map(lambda a: model.admissible * a, sums)
-    intercepted = jnp.cumsum(sums.rows[0])[samples.max_span - 1 : samples.max_span + samples.count]
-    gap = jnp.maximum(jnp.sum(energy) - intercepted, 0.0)
+    intercepted_from = jnp.cumsum(sums.rows[0][::-1])[::-1]
+    remaining = sums.passing + intercepted_from[samples.max_span : samples.max_span + samples.count + 1]
+    # All of the energy is one or the other: the ratio takes off what the sums round.
+    gap = jnp.sum(energy) * remaining / (sums.passing + intercepted_from[0])
     sample_length = 0.5 * SPEED_OF_LIGHT * samples.width
     inside = sums.rows[1:, samples.max_span :]
     before = jnp.sum(sums.rows[1:, : samples.max_span])
@@ -185,11 +189,13 @@ class _RaySums(NamedTuple):
     """Sums over rays, weighted by their energy.
 
     - `rows`: by sample, with margins: the energy that is intercepted, the area (m) of leaf, and of bark.
+    - `passing`: the energy that leaf, bark and plates let pass to the ends of the rays.
     - `met`, `height`, `squared_height`: of each surface, the energy that meets it, and that times its height
       above where the axis meets it, and times the height's square.
     """
 
     rows: Float[Array, "3 padded"]
+    passing: Float[Array, ""]
     met: Float[Array, "surfaces"]
     height: Float[Array, "surfaces"]
     squared_height: Float[Array, "surfaces"]
@@ -207,7 +213,7 @@ def _sum_rays(
 
     def sum_chunk(x: Array, y: Array, e: Array) -> _RaySums:
         rays = send_rays(scene, (x, y), e)
-        return _RaySums(_sum_interception(scene, samples, rays), *_sum_heights(rays, axis_heights))
+        return _RaySums(*_sum_interception(scene, samples, rays), *_sum_heights(rays, axis_heights))
 
     arrays = (*across, energy)
     if energy.size <= _RAYS_AT_ONCE:
@@ -222,8 +228,10 @@ def _sum_rays(
     return jax.lax.scan(add, zero, chunks)[0]
 
 
-def _sum_interception(scene: DeviceScene, samples: TimeBins, rays: FootprintRays) -> Float[Array, "3 padded"]:
-    """Sum, by sample, the energy that leaf, bark and plates intercept, and the area of leaf and of bark."""
+def _sum_interception(
+    scene: DeviceScene, samples: TimeBins, rays: FootprintRays
+) -> tuple[Float[Array, "3 padded"], Float[Array, ""]]:
+    """Sum what leaf, bark and plates intercept and let pass: the first two fields of `_RaySums`."""
     medium, rows = scene.medium, jnp.zeros((3, samples.padded), rays.energy.dtype)
     plates = [
         (surface.coverage, jnp.where(distance <= rays.end, distance, FAR))
@@ -243,9 +251,10 @@ def _sum_interception(scene: DeviceScene, samples: TimeBins, rays: FootprintRays
         path = jnp.broadcast_to(rays.excess, distance.shape) + distance
         return samples.position(2.0 * path / SPEED_OF_LIGHT)
 
-    depths = [jnp.zeros_like(rays.energy) for _ in rays.surface_distances]
+    total_depth = jnp.zeros_like(rays.energy)
+    depths = [total_depth for _ in rays.surface_distances]
     if medium is not None:
-        segments, depths, _ = march_rays(scene, rays)
+        segments, depths, total_depth = march_rays(scene, rays)
         position = sample_position(segments.start)
         energy = jnp.broadcast_to(rays.energy, segments.start.shape)
         arriving = energy * plate_gap(segments.start + 0.5 * segments.length) * segments.extinction
@@ -265,7 +274,8 @@ def _sum_interception(scene: DeviceScene, samples: TimeBins, rays: FootprintRays
         stopped = jnp.where(is_met, rays.energy * coverage * plate_gap(distance) * jnp.exp(-depth), 0.0)
         nearest = jnp.round(sample_position(jnp.where(is_met, distance, 0.0)))
         rows = rows.at[0, padded_index(samples, nearest, 1)].add(stopped)
-    return rows
+    behind_all = plate_gap(jnp.full_like(rays.energy, FAR))
+    return rows, jnp.sum(rays.energy * behind_all * jnp.exp(-total_depth))
 
 
 def _heights_on_axis(scene: DeviceScene) -> Float[Array, "surfaces"]:

@@ -250,6 +250,10 @@ def test_absent_quantities_are_nan_and_all_others_finite():
     solid = jl.VoxelMap.from_probability(leaf=np.ones((4, 4, 3)), voxel_size=10.0, origin=(-20, -20, 0))
     none = jl.truth_of(jl.Lidar(**NARROW_BEAM), jl.Scene(canopy=jl.Canopy(solid, leaf=LEAF, hotspot=False)))
     assert float(none.gap_probability[-1]) == pytest.approx(0.0, abs=1e-6)
+    # Small gaps have their relative precision: 1 less what is intercepted would have rounding of 1e-6.
+    deep = jl.VoxelMap.from_extinction(leaf=np.full((4, 4, 3), 0.4), voxel_size=10.0, origin=(-20, -20, 0))
+    little = jl.truth_of(jl.Lidar(**NARROW_BEAM), jl.Scene(canopy=jl.Canopy(deep, leaf=LEAF, hotspot=False)))
+    assert float(little.gap_probability[-1]) == pytest.approx(np.exp(-12.0), rel=1e-3)
 
 
 @pytest.mark.slow
