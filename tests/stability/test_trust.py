@@ -123,7 +123,7 @@ def finer_settings(lidar, scene, plan):
         "bin_width": plan.bins.width / 2,
         "window": (plan.sample_start, plan.sample_start + interval * (plan.n_samples - 1)),
     }
-    max_orders = jl.plan(lidar, scene, describe=False, **settings).limits.most_orders
+    max_orders = jl.plan(lidar, scene, describe=False, **settings).scope.affordable_orders
     return {**settings, "max_orders": min(2 * plan.orders, max_orders), "max_seconds": 30.0}
 
 
