@@ -167,7 +167,7 @@ def _check_table_path(ctx: Any, parameter: Any, path: Path) -> Path:
 @click.option(
     "--fit",
     is_flag=True,
-    help="Also fit a canopy of layers to each shot: about two minutes, and a second for each shot.",
+    help="Also fit a canopy of layers to each shot: about a minute, and a second for each shot.",
 )
 @click.option("--quiet", is_flag=True, help="Show no progress.")
 def gedi(files: tuple[Path, ...], out: Path, group: int, fit: bool, quiet: bool) -> int:

@@ -167,7 +167,7 @@ def gedi_table(
     - `fit_quality` and `fit_reasons`: of record and fit, about the ground. A shot that cannot be fitted is
       bad and has NaN.
 
-    They compile for one to two minutes, and then take about a second of one core each.
+    They compile for about a minute, and then take about a second of one core each.
 
     The closed forms are the first choice: `examples/validation` compares both with the products. The fitted
     ground is low, by 0.08 m in the median of 44 good fits of a savanna and by 0.32 m or more in a tenth. The
