@@ -241,7 +241,7 @@ def _kept_names(keep: Collection[str] | None) -> tuple[str, ...]:
         return OPTIONAL_ARRAYS
     # A string is a collection, too, of letters.
     admissible = f"names, as in keep=({', '.join(map(repr, OPTIONAL_ARRAYS))})"
-    check_kind("keep", keep, tuple | list | set | frozenset | None, f"a tuple of {admissible}, or None")
+    check_kind("keep", keep, tuple | list | set | frozenset, f"a tuple of {admissible}, or None")
     for name in keep:
         check_choice("keep", name, OPTIONAL_ARRAYS)
     return tuple(name for name in OPTIONAL_ARRAYS if name in keep)

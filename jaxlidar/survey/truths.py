@@ -88,9 +88,8 @@ class StrategyWithTruth(AbstractStrategy):
     light_strategy: AbstractStrategy
 
     @staticmethod
-    def around(light_strategy: AbstractStrategy) -> "StrategyWithTruth":
+    def around(light: AbstractStrategy) -> "StrategyWithTruth":
         """Return a strategy that traces light, with the truth of its shots."""
-        light = light_strategy
         return StrategyWithTruth(light.setup, light.survey, light.rtol, light.kept_names, light)
 
     @property
