@@ -34,12 +34,17 @@ def hooked_modules():
     return [name for name in names if name not in UNHOOKED]
 
 
-with install_import_hook(hooked_modules(), CHECKER):
-    import jaxlidar  # noqa: F401
+def pytest_configure(config):
+    """Import the packages with their checks, except in a process that only hands out tests to workers."""
+    if config.getoption("numprocesses", None) and not hasattr(config, "workerinput"):
+        return
+    with install_import_hook(hooked_modules(), CHECKER):
+        import jaxlidar  # noqa: F401
 
-    # Before `inversion` is imported, as in the processes that tests start: options are read there by then.
-    quick_compilation.optimise_programs()
-    import inversion  # noqa: F401
+        # Before `inversion` is imported, as in processes that tests start: options are read there by then.
+        quick_compilation.optimise_programs()
+        import inversion  # noqa: F401
+
 
 SHARED = Path(__file__).resolve().parents[2] / "shared" / "data"
 
