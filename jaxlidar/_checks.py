@@ -55,7 +55,12 @@ def as_array(x: ArrayLike | Sequence, field: str = "value", *, missing: bool = F
     if isinstance(x, jax.Array) and jnp.issubdtype(x.dtype, jnp.floating):
         return x
     check_numbers(field, x, missing=missing)
-    return jnp.asarray(_with_nan(x), dtype=float)
+    values = concrete(x)
+    if values is None:
+        return jnp.asarray(x, dtype=float)
+    # By NumPy: JAX would compile a conversion for every shape.
+    with np.errstate(over="ignore"):
+        return jnp.asarray(values.astype(jnp.result_type(float)))
 
 
 def as_numpy(x: Any, field: str = "value", *, missing: bool = False) -> Float[np.ndarray, "..."]:

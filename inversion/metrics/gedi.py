@@ -35,7 +35,7 @@ from jaxtyping import Array, Float, Int
 
 from inversion.fit.quality import Verdict, judge_record
 from inversion.metrics.records import refuse_baseline, size_bucket
-from jaxlidar.extend import as_numpy, check_integer, check_number, check_range, even_step
+from jaxlidar.extend import as_array, as_numpy, check_integer, check_number, check_range, even_step
 
 # Subdivisions of a bin, where a Gaussian is cut (in standard deviations), and shots computed at a time.
 _SUBDIVISIONS, _CUT, _CHUNK = 4, 2.5, 64
@@ -222,14 +222,14 @@ def metrics_of_records(padded: PaddedShots, settings: GediSettings) -> GediMetri
     # Of one size for all published settings, so that they share a program.
     half_lags = max(_HALF_LAGS, *(kernel.size // 2 for kernel in kernels))
     kernels = np.stack([np.pad(kernel, half_lags - kernel.size // 2) for kernel in kernels])
-    kernels = jnp.asarray(kernels, float)
-    thresholds = jnp.asarray((settings.front_threshold, settings.back_threshold), float)
+    kernels = as_array(kernels)
+    thresholds = as_array((settings.front_threshold, settings.back_threshold))
     top, step = padded.top, padded.step
     features = {name: np.zeros(len(top)) for name in _RecordFeatures._fields if name != "rh"}
     rh_position = np.zeros((len(top), _RH_FRACTIONS.size))
     for chunk, records, count, noise in padded.batches:
         computed = _record_features(
-            jnp.asarray(records, float), jnp.asarray(count), jnp.asarray(noise, float), kernels, thresholds
+            as_array(records), jnp.asarray(count), as_array(noise), kernels, thresholds
         )
         for name, values in features.items():
             values[chunk] = np.asarray(getattr(computed, name))[: chunk.size]

@@ -120,7 +120,7 @@ class EvenAxis(NamedTuple):
         values, first = concrete(x), concrete(self.first)
         if values is None or first is None:
             return as_array(x, field, missing=True) - as_array(self.first)
-        return jnp.asarray(values - first, float)
+        return as_array(values - first)
 
     def absolute(self, x: Array) -> Array:
         """Inverse of `relative`, in the precision of `x`."""
@@ -169,7 +169,7 @@ def divide_by_largest(
     values = np.where(np.isinf(sigma), 0.0, values)
     magnitude = np.max(np.abs(values), axis=-1)
     magnitude = np.where(magnitude > 0, magnitude, 1.0)
-    return jnp.asarray(values / magnitude[..., None], _float_type(x)), magnitude
+    return jnp.asarray((values / magnitude[..., None]).astype(_float_type(x))), magnitude
 
 
 def divide(x: ArrayLike, divisor: Array | np.ndarray, field: str) -> Array:
@@ -181,7 +181,7 @@ def divide(x: ArrayLike, divisor: Array | np.ndarray, field: str) -> Array:
     quotient, dtype = values / divisor_values, _float_type(x)
     # A number that the type cannot hold is large, not infinite: infinite noise has another meaning.
     limit = float(jnp.finfo(dtype).max)
-    return jnp.asarray(np.where(np.isinf(quotient), quotient, np.clip(quotient, -limit, limit)), dtype)
+    return jnp.asarray(np.where(np.isinf(quotient), quotient, np.clip(quotient, -limit, limit)).astype(dtype))
 
 
 def _float_type(x: ArrayLike) -> jnp.dtype:
@@ -322,7 +322,7 @@ def sample_pulse(pulse: Pulse | None, step: ArrayLike) -> Float[Array, "... padd
         if np.ptp(steps) <= _EQUAL_STEPS * np.min(steps):
             steps = np.min(steps)
         half = max(1, math.ceil(max(map(abs, pulse.support())) / np.min(steps)))
-        samples = pulse.power(jnp.asarray(np.arange(-half, half + 1) * steps[..., None], float))
+        samples = pulse.power(np.arange(-half, half + 1) * steps[..., None])
     else:
         samples = divide_by_largest(pulse, "pulse")[0] if np.size(pulse) > 1 else as_array(pulse, "pulse")
         check_range("pulse", samples)

@@ -404,6 +404,7 @@ def _safe_hypot(a: Array, b: Array) -> Array:
     return jnp.where(positive, jnp.sqrt(jnp.where(positive, square, 1.0)), 0.0)
 
 
+@jax.jit
 def _z_score(t: Array, sigma: Array) -> Array:
     """Compute t / sigma, clipped to +-40; for a sigma of zero it is +-40 with the sign of t."""
     inside = (sigma > _NEGLIGIBLE_WIDTH) & (jnp.abs(t) < _Z_MAX * sigma)
@@ -415,6 +416,7 @@ def _normal_pdf(z: Array) -> Array:
     return jnp.exp(-0.5 * z * z) / math.sqrt(2 * math.pi)
 
 
+@jax.jit
 def _normal_cdf(z: Array) -> Array:
     return 0.5 * erfc(-z / math.sqrt(2))
 
@@ -472,6 +474,7 @@ def _narrow_segment(t: Array, length: Array, sigma: Array) -> tuple[Array, Array
     return even, odd
 
 
+@jax.jit
 def _segment_integrals(t: Array, length: Array, sigma: Array) -> tuple[Array, Array]:
     """Compute E and O (see the module) of a linear segment centred on zero, for the jitter `sigma`."""
     wide = (length > 2 * sigma) & (length > _NEGLIGIBLE_WIDTH)
@@ -480,6 +483,7 @@ def _segment_integrals(t: Array, length: Array, sigma: Array) -> tuple[Array, Ar
     return jnp.where(wide, wide_even, even), jnp.where(wide, wide_odd, odd)
 
 
+@jax.jit
 def _exponential_tail(t: Array, sigma: Array, decay: Array) -> Array:
     """Compute phi(z) M(sigma/decay - z) with z = t/sigma, which an exponential tail subtracts from Phi(z)."""
     z = _z_score(t, sigma)

@@ -244,6 +244,7 @@ def _admissible_samples(energy: Array) -> Array:
     values = concrete(energy)
     if values is not None:
         check_range("energy", values[~np.isnan(values)], 0.0)
+        return energy
     return jnp.where((energy >= 0) & (energy < jnp.inf), energy, jnp.nan)
 
 
@@ -253,6 +254,12 @@ def _admissible_waveform(energy: Array) -> Array:
     if values is not None:
         check_range("energy", values[~np.isnan(values)])
         check_negative_energy(np.where(np.isnan(values), 0.0, values))
+    return _without_negative_waveforms(energy)
+
+
+@jax.jit
+def _without_negative_waveforms(energy: Array) -> Array:
+    """Return NaN for waveforms that are infinite or too far below zero."""
     missing = jnp.where(jnp.isnan(energy), 0.0, energy)
     positive = jnp.sum(jnp.maximum(missing, 0.0), axis=-1, keepdims=True)
     negative = jnp.sum(jnp.maximum(-missing, 0.0), axis=-1, keepdims=True)
@@ -270,10 +277,17 @@ def digitise(
     """
     if isinstance(receiver, PhotonCounter):
         return energy
+    if key is not None:
+        check_key(key)
+    return _digitise(energy, wavelength, receiver, key)
+
+
+@eqx.filter_jit
+def _digitise(energy: Array, wavelength: Array, receiver: Receiver, key: Array | None) -> Array:
+    """Apply the steps of `digitise`, in one program."""
     expected = energy + receiver.background
     value = expected
     if key is not None:
-        check_key(key)
         photon_key, electronic_key = jax.random.split(key)
         if receiver.photon_noise:
             value = _shot_noise(expected, wavelength, photon_key)
@@ -368,12 +382,21 @@ def first_return_window(
     ratio = interval / step
     # The tolerance keeps rounding of the ratio from adding an empty bin.
     samples = math.ceil(centres.size / ratio - 1e-6)
-    exceeds = jnp.any(energy.reshape(-1, centres.size) > threshold, axis=0)
+    # Neighbours share their edges to the last bit.
+    edges = (ratio * np.arange(samples + 1)).astype(energy.dtype)
+    first, energies = _sample_from_first_return(energy, threshold, edges)
+    middle = (ratio * np.arange(samples) + 0.5 * ratio - 0.5).astype(energy.dtype)
+    return centres[0] + step * (first + middle), energies
+
+
+@jax.jit
+def _sample_from_first_return(
+    energy: Float[Array, "*channels bins"], threshold: Float[Array, ""], edges: Float[Array, " edges"]
+) -> tuple[Float[Array, ""], Float[Array, "*channels samples"]]:
+    """Return the number of the first bin above the threshold, and energies between edges counted from it."""
+    bins = energy.shape[-1]
+    exceeds = jnp.any(energy.reshape(-1, bins) > threshold, axis=0)
     first = jnp.argmax(exceeds).astype(energy.dtype)
-    # Edges in units of fine bins from the start of the window, so that neighbours share theirs to the last
-    # bit.
-    edges = jnp.asarray(ratio * np.arange(samples + 1), energy.dtype)[:, None]
-    fine_edges = (np.arange(centres.size) - first)[None, :]
+    edges, fine_edges = edges[:, None], (np.arange(bins) - first)[None, :]
     overlap = jnp.clip(jnp.minimum(edges[1:], fine_edges + 1) - jnp.maximum(edges[:-1], fine_edges), 0.0)
-    times = centres[0] + step * (first + ratio * np.arange(samples) + 0.5 * ratio - 0.5)
-    return times, einsum("...b,sb->...s", energy, overlap)
+    return first, einsum("...b,sb->...s", energy, overlap)

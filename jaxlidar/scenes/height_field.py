@@ -130,6 +130,7 @@ class HeightField(AbstractShape):
     block_maxima: Float[Array, "blocks_x blocks_y"]
 
     @staticmethod
+    @eqx.filter_jit
     def of(heights: Raster) -> "HeightField":
         """Make the height field of a raster of heights in m."""
         values = heights.values

@@ -246,7 +246,7 @@ class MeshSurface(eqx.Module):
         self.law, self.two_sided, self.n_triangles = law, bool(two_sided), len(faces)
         # Relative to their middle, coordinates of millions of metres lose nothing in single precision.
         self.origin = np.round(0.5 * (vertices.min(axis=0) + vertices.max(axis=0)))
-        self.vertices = jnp.asarray(vertices - self.origin, float)
+        self.vertices = as_array(vertices - self.origin)
         order = tree_order(vertices[faces])
         self.faces = faces[order].astype(np.int32)
         numbers = np.searchsorted(np.unique(group), group) if by_material else np.zeros(len(faces), int)

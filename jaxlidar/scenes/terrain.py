@@ -210,15 +210,11 @@ class Terrain(AbstractGround):
             terrain, east, north = self, jnp.asarray(x), jnp.asarray(y)
         else:
             terrain = eqx.tree_at(lambda s: s.origin, self, jnp.zeros(2))
-            east, north = (jnp.asarray(v - o, float) for v, o in zip(values, origin))
+            east, north = (as_array(v - o) for v, o in zip(values, origin))
             if self.sides == "open" and self.relief:
                 for axis, v, low, high in zip("xy", values, origin, self.end):
                     check_range(axis, v, low, high)
-        shape = terrain.shape
-        if isinstance(shape, HeightField):
-            return shape.heights.value((east, north))
-        normal, offset = shape.tangent((east, north, jnp.zeros_like(east)))
-        return (offset - normal[0] * east - normal[1] * north) / normal[2]
+        return _height(terrain.shape, east, north)
 
     def is_plane(self) -> bool:
         """Return True if all heights lie in one plane, which must be level where the sides are periodic.
@@ -266,6 +262,15 @@ class Terrain(AbstractGround):
         x, y = _nodes_from_middle(heights.shape)
         east = (heights * x[:, None]).mean() / (x * x).mean() / spacing[0]
         return (east, (heights * y[None, :]).mean() / (y * y).mean() / spacing[1]), mean
+
+
+@eqx.filter_jit
+def _height(shape: AbstractShape, x: Array, y: Array) -> Float[Array, "..."]:
+    """Height of a terrain's shape, m, at positions relative to its origin, m."""
+    if isinstance(shape, HeightField):
+        return shape.heights.value((x, y))
+    normal, offset = shape.tangent((x, y, jnp.zeros_like(x)))
+    return (offset - normal[0] * x - normal[1] * y) / normal[2]
 
 
 def _nodes_from_middle(shape: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:

@@ -12,6 +12,7 @@ from collections.abc import Callable, Sequence
 from typing import ClassVar, final
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
@@ -191,11 +192,7 @@ class VoxelMap(eqx.Module):
             if p is None:
                 return None
             check_range(name, p, 0.0, 1.0)
-            p = as_array(p, name)
-            is_open = p < 1.0
-            # The inner `where` keeps log(0), whose derivative is infinite, out of the solid voxels.
-            depth = jnp.where(is_open, -jnp.log1p(-jnp.where(is_open, p, 0.0)), SOLID_OPTICAL_DEPTH)
-            return depth / size[2]
+            return _extinction_of_probability(as_array(p, name), size[2])
 
         return VoxelMap(extinction("leaf", leaf), extinction("bark", bark), size, origin)
 
@@ -266,7 +263,7 @@ class VoxelMap(eqx.Module):
         # 2. Split it into whole layers and a fraction, counted from the lowest column.
         base = np.floor(lift.min())
         whole_layers = np.floor(lift - base).astype(int)
-        fraction = jnp.asarray(lift - base - whole_layers, float)[:, :, None]
+        fraction = as_array(lift - base - whole_layers)[:, :, None]
         more_layers = int(np.ceil((lift - base).max()))
         # 3. Layer k of the lifted map takes from the layers k - whole_layers and k - whole_layers - 1 of the
         #    map, which is padded with empty layers.
@@ -288,3 +285,14 @@ class VoxelMap(eqx.Module):
         **Returns:** (nx, ny, nz) NumPy array in 1/m.
         """
         return np.sum([np.asarray(a) for a in (self.leaf, self.bark) if a is not None], axis=0)
+
+
+@jax.jit
+def _extinction_of_probability(
+    p: Float[Array, "nx ny nz"], edge: Float[Array, ""]
+) -> Float[Array, "nx ny nz"]:
+    """Return the extinction coefficient in 1/m of voxels that a ray along an edge in m meets with `p`."""
+    is_open = p < 1.0
+    # The inner `where` keeps log(0), whose derivative is infinite, out of the solid voxels.
+    depth = jnp.where(is_open, -jnp.log1p(-jnp.where(is_open, p, 0.0)), SOLID_OPTICAL_DEPTH)
+    return depth / edge

@@ -22,6 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxlidar._checks import as_array
 from jaxlidar._constants import SPEED_OF_LIGHT
 from jaxlidar._products import einsum
 from jaxlidar._programs import Program
@@ -199,11 +200,11 @@ def _make_model(setup: Setup, n_samples: int, degree: int) -> WaveformModel:
     """
     lidar, plan, atmosphere = setup.lidar, setup.plan, setup.scene.atmosphere
     convolution, bins = pulse_convolution(lidar, plan, n_samples), plan.bins
-    bin_start, bin_width = (jnp.asarray(a, float) for a in (bins.start, bins.width))
+    bin_start, bin_width = (as_array(a) for a in (bins.start, bins.width))
     transmittance = air_return = air_relative_energy = None
     if atmosphere is not None:
-        fine_time = jnp.asarray(bins.start + bins.width * np.arange(bins.count))
-        start_distance = jnp.asarray(plan.limits.start_distance)
+        fine_time = as_array(bins.start + bins.width * np.arange(bins.count))
+        start_distance = as_array(plan.limits.start_distance)
         transmittance, fine_air_return = _compiled_atmosphere(
             atmosphere, lidar, fine_time, start_distance, bin_width
         )
@@ -216,7 +217,7 @@ def _make_model(setup: Setup, n_samples: int, degree: int) -> WaveformModel:
     return WaveformModel(
         optics=setup_optics(setup),
         convolution=convolution,
-        time=jnp.asarray(plan.sample_start + plan.sample_interval * np.arange(n_samples)),
+        time=as_array(plan.sample_start + plan.sample_interval * np.arange(n_samples)),
         bin_start=bin_start,
         bin_width=bin_width,
         transmittance=transmittance,

@@ -22,6 +22,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
+from jaxlidar._checks import as_array
 from jaxlidar._one_function import once
 from jaxlidar._products import FULL_PRECISION, einsum
 from jaxlidar._programs import Program
@@ -98,7 +99,7 @@ def pulse_convolution(lidar: Lidar, plan: Plan, n_samples: int | None = None) ->
         high = min(high, math.ceil((plan.pulse_support[1] + half) / bins.width - first_sample) + 2)
     # The edges of samples lie a whole number of fine bins apart; one more at each end serves the fluxes.
     edge_offset = np.arange(low - 1, high + bins_per_sample + 2) - 0.5 * bins_per_sample
-    edges = jnp.asarray((edge_offset + first_sample) * bins.width)
+    edges = as_array((edge_offset + first_sample) * bins.width)
     fractions = _compiled_fractions(lidar.pulse, lidar.jitter, edges, KERNEL_VARIANCE, bins_per_sample)
     return PulseConvolution(fractions, low, bins.count, n_samples, bins_per_sample)
 

@@ -3,7 +3,6 @@
 from typing import final
 
 import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
@@ -96,7 +95,7 @@ def sampled_pulse(lidar: Lidar) -> Float[np.ndarray, " lags"]:
     # Edges of samples: those of lag i are the half intervals before and after it.
     half_sample = PULSE_OVERSAMPLING // 2
     edges = step * np.arange(-half - half_sample, half + half_sample + 1)
-    cumulative = np.asarray(lidar.pulse.cumulative(jnp.asarray(edges, float), jitter), float)
+    cumulative = np.asarray(lidar.pulse.cumulative(edges, jitter), float)
     return np.maximum(cumulative[PULSE_OVERSAMPLING:] - cumulative[:-PULSE_OVERSAMPLING], 0.0)
 
 

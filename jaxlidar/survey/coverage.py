@@ -2,11 +2,10 @@
 
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from jaxlidar._checks import check_kind
+from jaxlidar._checks import as_array, check_kind
 from jaxlidar._programs import Program
 from jaxlidar._summary import NOTABLE_FRACTION, percent
 from jaxlidar._vectors import FAR, vec
@@ -96,7 +95,7 @@ def _distances(
     for first in range(0, len(x), size):
         block = (a[first : first + size] for a in (x, w))
         rows = (np.concatenate([a, np.repeat(a[-1:], size - len(a), axis=0)]) for a in block)
-        distances.append(np.asarray(_compiled_distance(shape, *(jnp.asarray(a, float) for a in rows)), float))
+        distances.append(np.asarray(_compiled_distance(shape, *map(as_array, rows)), float))
     return np.concatenate(distances)[: len(x)]
 
 

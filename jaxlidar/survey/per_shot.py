@@ -32,6 +32,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
+from jaxlidar._checks import as_array
 from jaxlidar._programs import Program
 from jaxlidar._threads import ONE_CORE
 from jaxlidar._workers import WorkUnit, task
@@ -103,7 +104,7 @@ class ShotGeometry(NamedTuple):
         """Return the same in JAX's present precision."""
 
         def convert(a: Any) -> Any:
-            return None if a is None else jnp.asarray(a, float)
+            return None if a is None else as_array(a)
 
         return ShotGeometry(jnp.asarray(self.number), *map(convert, self[1:]))
 

@@ -43,6 +43,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 from scipy import sparse
 
+from jaxlidar._checks import as_array
 from jaxlidar._programs import Program
 from jaxlidar._threads import ONE_CORE
 from jaxlidar._workers import WorkUnit, task
@@ -409,7 +410,7 @@ def trace_group(
         shape = (len(group.shots), context.view_geometry.max_shots)
         diagonal = sparse.dia_array((unit_diagonal, 0), shape)
         coefficients = sparse.csr_array(diagonal)
-    light = GroupLight(_nodes(group, context.spacing), shot_views, jnp.asarray(group.aim, float))
+    light = GroupLight(_nodes(group, context.spacing), shot_views, as_array(group.aim))
 
     def trace(numbers: range) -> RunningMoments:
         # As arrays, since Python numbers are static: each round would compile a program of its own.
@@ -449,12 +450,12 @@ def _nodes(group: NodeGroup, spacing: float) -> EntryNodes:
         return (
             jnp.asarray(allocation.node, jnp.int32),
             jnp.asarray(allocation.rank, jnp.int32),
-            jnp.asarray(allocation.fraction, float),
+            as_array(allocation.fraction),
         )
 
     return EntryNodes(
-        jnp.asarray(group.node_position, float),
-        jnp.asarray(spacing, float),
+        as_array(group.node_position),
+        as_array(spacing),
         *arrays(group.photons),
         *arrays(group.rays),
     )
