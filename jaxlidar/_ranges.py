@@ -14,6 +14,7 @@ from collections.abc import Iterator, Mapping
 from typing import Any, NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool
@@ -115,7 +116,13 @@ def reasons(tree: Any) -> dict[str, Bool[Array, ""]]:
 
 def is_outside(x: Any, admissible: Range) -> Bool[Array, ""]:
     """Return True if an element of `x` is not finite, out of order, or out of range by more than rounding."""
-    x, (low, high, low_open, high_open, mirrored, increasing) = as_array(x), admissible
+    return _is_outside(as_array(x), admissible)
+
+
+@functools.partial(jax.jit, static_argnames="admissible")
+def _is_outside(x: Array, admissible: Range) -> Bool[Array, ""]:
+    """Return True if an element of an array of floats is inadmissible."""
+    low, high, low_open, high_open, mirrored, increasing = admissible
     in_order = jnp.all(jnp.diff(x) > 0) if increasing and x.ndim else True
     x = jnp.abs(x) if mirrored else x
     slack = _ROUNDING * float(jnp.finfo(x.dtype).eps)

@@ -113,14 +113,19 @@ def wiener(
     """
     check_range("noise_to_signal", noise_to_signal, 0.0, low_open=True)
     (y, magnitude), h = _scaled_waveform(power), _unit_pulse(pulse)
+    return _wiener(y, h, noise_to_signal) * jnp.asarray(magnitude, y.dtype)
+
+
+@jax.jit
+def _wiener(y: Samples, h: Float[Array, " lags"], noise_to_signal: Array) -> Samples:
+    """Deconvolve a record `y` by a pulse `h` of unit sum."""
     # Of the full convolution of record and pulse: the transforms do not wrap around.
     size = y.size + h.size - 1
     spectrum = jnp.fft.rfft(h, size)
     gain = jnp.conj(spectrum) / (jnp.abs(spectrum) ** 2 + noise_to_signal)
     # The first lag of the pulse lies half its length before time zero, and so does the padded record's start.
     padded = jnp.pad(y, ((h.size - 1) // 2, (h.size - 1) // 2))
-    sharp = jnp.fft.irfft(jnp.fft.rfft(padded) * gain, size)[: y.size]
-    return sharp * jnp.asarray(magnitude, sharp.dtype)
+    return jnp.fft.irfft(jnp.fft.rfft(padded) * gain, size)[: y.size]
 
 
 def _convolve(y: Samples, h: Float[Array, " lags"]) -> Samples:

@@ -344,13 +344,7 @@ class SampledPulse(AbstractPulse):
 
     def _segments(self) -> tuple[Array, Array, Array, Array]:
         """Centre, length, mean power and half rise of each linear segment, scaled to unit area."""
-        low, high = self.time[:-1], self.time[1:]
-        # The largest sample is divided out first: powers of 1e-20 W would underflow in the products. It
-        # cancels in the result, so its derivative is zero.
-        power = self.samples / jax.lax.stop_gradient(jnp.max(self.samples))
-        mean, rise = 0.5 * (power[1:] + power[:-1]), 0.5 * (power[1:] - power[:-1])
-        area = jnp.sum(mean * (high - low))
-        return 0.5 * (low + high), high - low, mean / area, rise / area
+        return _linear_segments(self.time, self.samples)
 
     def cumulative(self, t: ArrayLike, jitter: ArrayLike = 0.0) -> Float[Array, "..."]:
         centre, length, mean, rise = self._segments()
@@ -472,6 +466,18 @@ def _narrow_segment(t: Array, length: Array, sigma: Array) -> tuple[Array, Array
         value = 0.5 * weight * _normal_cdf(_z_score(t - 0.5 * x * length, sigma))
         even, odd = even + value, odd + x * value
     return even, odd
+
+
+@jax.jit
+def _linear_segments(time: Array, samples: Array) -> tuple[Array, Array, Array, Array]:
+    """Centre, length, mean power and half rise of each segment between samples, scaled to unit area."""
+    low, high = time[:-1], time[1:]
+    # The largest sample is divided out first: powers of 1e-20 W would underflow in the products. It cancels
+    # in the result, so its derivative is zero.
+    power = samples / jax.lax.stop_gradient(jnp.max(samples))
+    mean, rise = 0.5 * (power[1:] + power[:-1]), 0.5 * (power[1:] - power[:-1])
+    area = jnp.sum(mean * (high - low))
+    return 0.5 * (low + high), high - low, mean / area, rise / area
 
 
 @jax.jit

@@ -36,6 +36,7 @@ import math
 from typing import ClassVar, final
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
@@ -101,7 +102,12 @@ def rayleigh_optical_depth(wavelength: ArrayLike) -> Float[Array, "..."]:
     >>> print(f"{float(rayleigh_optical_depth(532.0)):.3f}")
     0.111
     """
-    micrometres = _checked_wavelength(wavelength) * 1e-3
+    return _rayleigh_optical_depth(_checked_wavelength(wavelength) * 1e-3)
+
+
+@jax.jit
+def _rayleigh_optical_depth(micrometres: Float[Array, "..."]) -> Float[Array, "..."]:
+    """Compute the Rayleigh optical depth at wavelengths in micrometres."""
     # In the notation of the source: w is the squared wavenumber in 1/micrometre^2, d = n - 1. The small
     # difference d is computed by itself, as n would lose its digits.
     w = micrometres**-2
@@ -287,6 +293,11 @@ class Atmosphere(eqx.Module):
         check_range("height", height)
         check_range("altitude", altitude)
         check_range("zenith", zenith, 0.0, 89.0)
+        return self._optical_depth(wavelength, height, altitude, zenith)
+
+    @eqx.filter_jit
+    def _optical_depth(self, wavelength: Array, height: Array, altitude: Array, zenith: Array) -> Array:
+        """Compute the one-way optical depth of admissible arguments."""
         slant = 1 / jnp.cos(jnp.deg2rad(zenith))
         thickness = jnp.maximum(altitude - height, 0.0)
         total = jnp.zeros(wavelength.shape + height.shape)
