@@ -186,13 +186,9 @@ def gaussian_decomposition(
     check_range("pulse_error", pulse_error, 0.0)
     times = even_axis("time", time)
     y, magnitude = divide_by_largest(power, "power", noise)
-    # Beyond these limits noise changes nothing, but the squares of weights would overflow or vanish.
     sigma = _over_magnitude(noise, magnitude)
-    sigma = jnp.where(jnp.isinf(sigma), sigma, jnp.clip(sigma, *_NOISE_LIMITS))
-    size = size_bucket(bins)
-    # Padding has no weight: it does not count as recorded.
-    weight = pad_to(jnp.broadcast_to(1.0 / sigma, y.shape), size)
-    arrays = {"power": pad_to(y, size), "weight": weight, "step": jnp.asarray(times.step, y.dtype)}
+    padded, weight = _padded_to(size_bucket(bins), y, sigma)
+    arrays = {"power": padded, "weight": weight, "step": jnp.asarray(times.step, y.dtype)}
     if pulse is None:
         assert width is not None
         check_range("width", width, 0.0, low_open=True)
@@ -204,19 +200,8 @@ def gaussian_decomposition(
         echoes = _compiled_decomposition("copies", max_echoes)(**arrays)
         if broaden:
             # For each record the one or the other: a width that does not pay for itself is zero.
-            broadened = _compiled_decomposition("broadened", max_echoes)(**arrays)
-            is_better = broadened.criterion < echoes.criterion
-            echoes = jax.tree.map(partial(_select, is_better), broadened, echoes)
-    # The program counts time from the first sample; empty entries stay zero.
-    absolute_time = jnp.where(echoes.amplitude > 0, times.absolute(echoes.time), 0.0)
-    unit = jnp.asarray(magnitude, y.dtype)[..., None]
-    per_parameter = jnp.stack([unit, jnp.ones_like(unit), jnp.ones_like(unit)], axis=-1)
-    return echoes._replace(
-        amplitude=echoes.amplitude * unit,
-        time=absolute_time,
-        stderr=echoes.stderr * per_parameter,
-        model=echoes.model[..., :bins] * unit,
-    )
+            echoes = _better(_compiled_decomposition("broadened", max_echoes)(**arrays), echoes)
+    return _in_units(echoes, times.first, jnp.asarray(magnitude, y.dtype), bins)
 
 
 @decompose_records.register
@@ -247,9 +232,39 @@ def _over_magnitude(noise: ArrayLike, magnitude: Array | np.ndarray) -> Array:
     return divide(noise, magnitude if np.ndim(magnitude) == 0 else magnitude[..., None], "noise")
 
 
+@partial(jax.jit, static_argnames="size")
+def _padded_to(size: int, y: Array, sigma: Array) -> tuple[Array, Array]:
+    """Pad records to `size` samples, and return them with their weights, one over the noise."""
+    # Beyond these limits noise changes nothing, but the squares of weights would overflow or vanish.
+    sigma = jnp.where(jnp.isinf(sigma), sigma, jnp.clip(sigma, *_NOISE_LIMITS))
+    # Padding has no weight: it does not count as recorded.
+    return pad_to(y, size), pad_to(jnp.broadcast_to(1.0 / sigma, y.shape), size)
+
+
+@jax.jit
+def _better(a: Echoes, b: Echoes) -> Echoes:
+    """Return for each record the echoes of the lower criterion."""
+    return jax.tree.map(partial(_select, a.criterion < b.criterion), a, b)
+
+
 def _select(condition: Array, a: Array, b: Array) -> Array:
     """Choose between arrays that have more dimensions, after those of the condition."""
     return jnp.where(condition.reshape(condition.shape + (1,) * (a.ndim - condition.ndim)), a, b)
+
+
+@partial(jax.jit, static_argnames="bins")
+def _in_units(echoes: Echoes, first_time: ArrayLike, magnitude: Array, bins: int) -> Echoes:
+    """Return echoes in the units of records, with the times of the record, and models of `bins` samples."""
+    # The program counts time from the first sample; empty entries stay zero.
+    time = jnp.where(echoes.amplitude > 0, jnp.asarray(first_time, echoes.time.dtype) + echoes.time, 0.0)
+    unit = magnitude[..., None]
+    per_parameter = jnp.stack([unit, jnp.ones_like(unit), jnp.ones_like(unit)], axis=-1)
+    return echoes._replace(
+        amplitude=echoes.amplitude * unit,
+        time=time,
+        stderr=echoes.stderr * per_parameter,
+        model=echoes.model[..., :bins] * unit,
+    )
 
 
 @lru_cache
