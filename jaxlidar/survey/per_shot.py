@@ -55,12 +55,16 @@ from jaxlidar.spectral.apply_optics import (
 from jaxlidar.survey.results import ShotErrors, ShotResults, make_shot_results
 from jaxlidar.survey.strategy import AbstractStrategy, slices_of_shots
 from jaxlidar.trace.device_scene import DeviceScene, aim_at, build_device_scene
+from jaxlidar.trace.first_order import FirstOrderTally
 from jaxlidar.trace.footprint import RaySlice, make_beam
 from jaxlidar.trace.lattices_of_shots import (
+    LatticeParts,
     LatticeSums,
+    add_parts,
     can_trace_parts,
+    empty_tally,
+    lattice_sums,
     response_of_lattice,
-    trace_parts,
 )
 from jaxlidar.trace.response import Response, footprint_shift, trace_device_scene, trace_first_only
 
@@ -428,14 +432,15 @@ def _trace_together(
     """Trace the lattices of a group of shots, each in `n_parts` parts.
 
     1. List the parts of all lattices of all shots, shot by shot.
-    2. Trace them, a block of parts at a time, and add them to the sums of their lattices.
+    2. Trace them, a block of parts at a time, and add them to the tally of their lattices.
     3. Of each shot: apply optics and pulse to the lattices, whose scatter tells the errors, and to their
        mean.
     """
     optics = setup_optics(setup)
     # Step 1. The list ends, for each shot, at:
     ends = jnp.cumsum(n_parts * MIN_BATCHES)
-    n_rows, block_size = len(n_parts), len(n_parts) * MIN_BATCHES
+    n_rows, n_lattices = len(n_parts), len(n_parts) * MIN_BATCHES
+    block_size = n_lattices
     lattices = jnp.arange(MIN_BATCHES)
 
     def shifts_of(shot: ShotGeometry) -> Array:
@@ -451,29 +456,28 @@ def _trace_together(
     aims = jnp.pad(offsets - offsets[:1], ((0, 0), (0, 3 - offsets.shape[1])))
 
     # Step 2.
-    def trace_block(block: Array | int) -> tuple[Array, Array, LatticeSums]:
+    def add_block(block: Array, tally: FirstOrderTally) -> FirstOrderTally:
         number = block * block_size + jnp.arange(block_size, dtype=jnp.int32)
         row = jnp.minimum(jnp.searchsorted(ends, number, side="right"), n_rows - 1)
         in_shot = number - (ends[row] - n_parts[row] * MIN_BATCHES)
         lattice, part = in_shot % MIN_BATCHES, in_shot // MIN_BATCHES
         # Parts that fill up the last block are traced in vain, as the first ones of their shot.
         exists, count = number < ends[-1], jnp.maximum(n_parts[row], 1)
-        ray_slices = RaySlice(jnp.where(exists, part, 0), count)
-        beams_of_parts = jax.tree.map(lambda a: a[row], beams)
-        sums = trace_parts(
-            scene_of_first, beams_of_parts, aims[row], shifts[row, lattice], ray_slices, _RAYS_OF_PART
+        parts = LatticeParts(
+            lattice=row * MIN_BATCHES + lattice,
+            energy=jnp.where(exists, 1.0 / count, 0.0),
+            beams=jax.tree.map(lambda a: a[row], beams),
+            aims=aims[row],
+            shifts=shifts[row, lattice],
+            ray_slices=RaySlice(jnp.where(exists, part, 0), count),
         )
-        # Every part has the energy of the complete beam: the lattice is their mean.
-        weight = jnp.where(exists, 1.0 / count, 0.0)
-        return row, lattice, jax.vmap(lambda w, part: jax.tree.map(lambda a: w * a, part))(weight, sums)
+        return add_parts(scene_of_first, tally, parts, n_lattices, _RAYS_OF_PART)
 
-    def add_block(block: Array, sums: LatticeSums) -> LatticeSums:
-        row, lattice, parts = trace_block(block)
-        return jax.tree.map(lambda a, b: a.at[row, lattice].add(b), sums, parts)
-
-    shapes = jax.eval_shape(trace_block, 0)[2]
-    no_sums = jax.tree.map(lambda a: jnp.zeros((n_rows, MIN_BATCHES, *a.shape[1:]), a.dtype), shapes)
-    sums = jax.lax.fori_loop(0, -(-ends[-1] // block_size), add_block, no_sums)
+    no_rays = empty_tally(scene_of_first, n_lattices)
+    tally = jax.lax.fori_loop(0, -(-ends[-1] // block_size), add_block, no_rays)
+    sums = jax.tree.map(
+        lambda a: a.reshape(n_rows, MIN_BATCHES, *a.shape[1:]), lattice_sums(scene, tally, n_lattices)
+    )
 
     # Step 3.
     def results_of(shot: ShotGeometry, sums: LatticeSums) -> ShotResults:

@@ -198,7 +198,7 @@ def march_rays(scene: DeviceScene, rays: FootprintRays) -> tuple[RaySegments, li
     return march(medium, rays.x, rays.w, rays.end, rays.surface_distances, max_segments, max_segment)
 
 
-class _FirstOrderTally(NamedTuple):
+class FirstOrderTally(NamedTuple):
     """Sums over rays while they are deposited, in rows (axis `entries`): see `FirstOrderTracer.row`.
 
     `returned`: by row and padded bin. `arrived`, `scattered`: by row. `escaped`: by history, or by group.
@@ -248,6 +248,11 @@ class FirstOrderTracer:
         """Numbers of materials and of histories, whose product is that of the rows of a tally."""
         return len(self.scene.config.materials), self.scene.first_histories.count
 
+    @property
+    def n_medium_materials(self) -> int:
+        """Number of materials of the medium, leaf and bark, which are the first ones."""
+        return sum(scatterer is not None for scatterer in (self.scene.config.leaf, self.scene.config.bark))
+
     def trace_chunk(self, across: tuple[Scalar, Scalar], energy: Scalar) -> ChunkTally:
         """Trace a chunk of rays, and sum what they return."""
         scene = self.scene
@@ -259,13 +264,16 @@ class FirstOrderTracer:
         arrived, scattered = tally.arrived.reshape(self.shape), tally.scattered.reshape(self.shape)
         return ChunkTally(tally.returned, arrived, scattered, tally.escaped, tally.slopes)
 
-    def trace_rays(self, rays: FootprintRays) -> _FirstOrderTally:
+    def trace_rays(self, rays: FootprintRays) -> FirstOrderTally:
         """Trace rays that have been sent, by the steps of `first_order`."""
+        return self.smooth(self.add_rays(self.empty_tally(rays.energy), rays))
+
+    def add_rays(self, tally: FirstOrderTally, rays: FootprintRays) -> FirstOrderTally:
+        """Add rays that have been sent to a tally, whose returns are not smoothed."""
         scene, slopes, energy = self.scene, self.scene.slopes, rays.energy
         # Step 1.
         depth_at_surfaces = [jnp.zeros_like(energy) for _ in rays.surface_distances]
         total_depth, slopes_at_surfaces = jnp.zeros_like(energy), []
-        tally = self.empty_tally(energy)
         if scene.medium is not None:
             segments, depth_at_surfaces, total_depth = march_rays(scene, rays)
             if slopes is not None:
@@ -286,27 +294,35 @@ class FirstOrderTracer:
                 # Segments of zero extinction return nothing, but have derivatives.
                 contributes = segments.extinction > 0.0 if scene.derivatives == "none" else None
                 tally = add_in_blocks(self.deposit_segments, tally, segments, per_ray, contributes)
-            # Step 3. All energy that collides in the medium is scattered.
-            tally = tally._replace(returned=smooth_padded(tally.returned), scattered=tally.arrived)
-            if tally.slopes is not None:
-                smooth = smooth_bins(jnp.swapaxes(tally.slopes, 1, 2))[..., 1:-1]
-                tally = tally._replace(slopes=jnp.swapaxes(smooth, 1, 2))
-        # Steps 4 and 5.
+        # Steps 3 and 4.
         tally = self.deposit_surfaces(tally, rays, depth_at_surfaces, slopes_at_surfaces)
         return self.add_escape(tally, rays, total_depth)
 
-    def empty_tally(self, energy: Scalar) -> _FirstOrderTally:
+    def smooth(self, tally: FirstOrderTally) -> FirstOrderTally:
+        """Smooth what the medium returns, step 5, once for all rays; surfaces return light at an instant."""
+        n_rows = self.n_medium_materials * (tally.returned.shape[0] // self.shape[0])
+        if n_rows == 0:
+            return tally
+        returned, slopes = tally.returned, tally.slopes
+        returned = returned.at[:n_rows].set(smooth_padded(returned[:n_rows]))
+        if slopes is not None:
+            smooth = smooth_bins(jnp.swapaxes(slopes[:n_rows], 1, 2))[..., 1:-1]
+            slopes = slopes.at[:n_rows].set(jnp.swapaxes(smooth, 1, 2))
+        # All energy that collides in the medium is scattered.
+        scattered = tally.scattered.at[:n_rows].set(tally.arrived[:n_rows])
+        return tally._replace(returned=returned, scattered=scattered, slopes=slopes)
+
+    def empty_tally(self, energy: Scalar) -> FirstOrderTally:
         """Return a tally of zeros for rays with these fractions of the energy."""
         scene, (n_materials, n_histories) = self.scene, self.shape
-        # Numbers of rows of materials, and of what escapes.
-        n_rows, n_escaped = n_materials * n_histories, n_histories
-        if self.n_groups is not None:
-            n_rows, n_escaped = self.n_groups * n_materials, self.n_groups
+        # Rows of a material, and of what escapes.
+        n_columns = n_histories if self.n_groups is None else self.n_groups
+        n_rows, n_escaped = n_materials * n_columns, n_columns
         padded = scene.bins.padded
         return_slopes = None
         if scene.slopes is not None:
             return_slopes = jnp.zeros((n_rows, padded, scene.slopes.count), energy.dtype)
-        tally = _FirstOrderTally(
+        tally = FirstOrderTally(
             returned=jnp.zeros((n_rows, padded), energy.dtype),
             arrived=jnp.zeros((n_rows,), energy.dtype),
             scattered=jnp.zeros((n_rows,), energy.dtype),
@@ -319,10 +335,9 @@ class FirstOrderTracer:
         self, material: int, history: Int[Array, "..."] | int, rays: FootprintRays
     ) -> Int[Array, "..."] | int:
         """Return the row of a material and a history in a tally; an integer where it is that of all rays."""
-        n_materials, n_histories = self.shape
-        if rays.group is None:
-            return material * n_histories + history
-        return rays.group * n_materials + material
+        if self.n_groups is None:
+            return material * self.shape[1] + history
+        return material * self.n_groups + rays.group
 
     def seen_energy(self, rays: FootprintRays) -> Scalar:
         """Return what the receiver sees of rays, at the ground or at the reference plane."""
@@ -333,11 +348,11 @@ class FirstOrderTracer:
     # Materials are deposited one after the other, so that each has its own histories and intensity factor.
     def deposit_segments(
         self,
-        tally: _FirstOrderTally,
+        tally: FirstOrderTally,
         segments: RaySegments,
         per_ray: tuple[FootprintRays, Scalar],
         extinctions: tuple[Scalar | None, Scalar | None] | None = None,
-    ) -> _FirstOrderTally:
+    ) -> FirstOrderTally:
         """Add segments to a tally.
 
         `per_ray`: the ray of each, and its seen energy. `extinctions`: those of leaf and of bark, 1/m; None
@@ -392,11 +407,11 @@ class FirstOrderTracer:
 
     def deposit_surfaces(
         self,
-        tally: _FirstOrderTally,
+        tally: FirstOrderTally,
         rays: FootprintRays,
         depth_at_surfaces: list[Scalar],
         slopes_at_surfaces: list[Float[Array, "rays parameters"]],
-    ) -> _FirstOrderTally:
+    ) -> FirstOrderTally:
         """Deposit the return of every surface at an instant, and the energy that arrives there.
 
         `slopes_at_surfaces`: derivatives of the depths with respect to parameters; empty without score
@@ -445,9 +460,7 @@ class FirstOrderTracer:
                     return_slopes = add_parameter_rows(return_slopes, tally_row, first_bin, rows)
         return tally._replace(returned=returned, arrived=arrived, scattered=scattered, slopes=return_slopes)
 
-    def add_escape(
-        self, tally: _FirstOrderTally, rays: FootprintRays, total_depth: Scalar
-    ) -> _FirstOrderTally:
+    def add_escape(self, tally: FirstOrderTally, rays: FootprintRays, total_depth: Scalar) -> FirstOrderTally:
         """Add what is left of rays that meet no ground."""
         escaped = tally.escaped
         # Rays that meet the ground end there; only those that fly past it escape.
@@ -475,9 +488,9 @@ def first_order(
 
     1. Send the rays, and march them through the voxels into segments.
     2. Deposit the return of every segment and material, bin by bin, and the energy that arrives there.
-    3. Smooth the sum over bins: smoothing is linear, so that only the sum is smoothed.
-    4. Deposit the return of every surface at an instant, and the energy that arrives there.
-    5. What is left of rays that meet no ground escapes.
+    3. Deposit the return of every surface at an instant, and the energy that arrives there.
+    4. What is left of rays that meet no ground escapes.
+    5. Smooth what segments return over bins: smoothing is linear, so that only the sum is smoothed.
     """
     tracer, bins = FirstOrderTracer(scene, mirror), scene.bins
 

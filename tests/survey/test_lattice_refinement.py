@@ -14,7 +14,7 @@ from jaxlidar.survey.per_shot import aim_offset, setup_of_shot, shot_geometry, t
 from jaxlidar.trace.device_scene import aim_at, build_device_scene
 from jaxlidar.trace.first_order import first_order
 from jaxlidar.trace.footprint import RaySlice, fibonacci_disc, make_beam
-from jaxlidar.trace.lattices_of_shots import trace_parts
+from jaxlidar.trace.lattices_of_shots import LatticeParts, add_parts, empty_tally, lattice_sums
 from tests.helpers import BY_PRECISION
 
 KEY = jax.random.key(5)
@@ -126,7 +126,12 @@ def test_parts_of_many_shots_are_those_of_single_ones(precision, shots_of):
         offsets = jax.vmap(lambda shot: aim_offset(setup, shot))(shots)
         beams = jax.vmap(lambda shot: make_beam(setup_of_shot(setup, shot).lidar))(shots)
         aims = jnp.pad(offsets - offsets[:1], ((0, 0), (0, 3 - offsets.shape[1])))
-        together = trace_parts(aim_at(scene, setup.lidar, offsets[0]), beams, aims, shifts, slices, n_rays)
+        first_aim, tally = aim_at(scene, setup.lidar, offsets[0]), empty_tally(scene, 3)
+        # In two chunks, which are added to one tally: they have 0.3 and 0.7 of the energy.
+        for energy in (0.3, 0.7):
+            parts = LatticeParts(jnp.arange(3), jnp.full(3, energy), beams, aims, shifts, slices)
+            tally = add_parts(first_aim, tally, parts, 3, n_rays)
+        together = lattice_sums(scene, tally, 3)
 
         def trace_alone(lattice):
             shot, offset, beam, shift, ray_slice = lattice
