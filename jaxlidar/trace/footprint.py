@@ -277,6 +277,27 @@ def fibonacci_disc(
     return across_beam(beam, u, turn), jnp.full((count,), 1.0 / count, u.dtype)
 
 
+def interleaving_shifts(shift: Float[Array, "2"], count: int) -> Float[Array, "lattices 2"]:
+    """Return shifts of `count` Fibonacci discs that make up one disc of `count` times as many rays.
+
+    Ray k of each, k = 0, 1, ..., becomes number count k + j of the dense disc, which turns from ray to ray by
+    the angle a with count a = golden angle, in whole turns and a fraction. Of the angles that fulfil this the
+    one is taken whose multiples stay farthest from whole turns. If `shift` is uniform in [0, 1), so is every
+    shift: each disc is an unbiased estimate on its own, and their scatter an upper bound of the variance of
+    their mean, which lacks the gaps that discs shifted independently would leave.
+    """
+    angles = (GOLDEN + np.arange(count)) / count
+    multiples = np.arange(1, 8 * count)
+    distance = np.abs((m := np.outer(angles, multiples)) - np.round(m))
+    angle = angles[np.argmax(np.min(multiples * distance, axis=1))]
+    number = jnp.arange(count, dtype=shift.dtype)
+    radial = shift[0] + number / count
+    # A disc that is shifted by a whole ray continues with its next one, which has turned by the golden angle.
+    n_rays = jnp.floor(radial)
+    turn = shift[1] + number * angle - n_rays * GOLDEN
+    return jnp.stack([radial - n_rays, turn - jnp.floor(turn)], axis=1)
+
+
 def product_rule(
     beam: Beam, radial: int = 12, angular: int = 32
 ) -> tuple[tuple[Scalar, Scalar], Float[Array, "rays"]]:

@@ -13,7 +13,7 @@ from jaxlidar.survey.choose_strategy import choose_strategy
 from jaxlidar.survey.per_shot import aim_offset, setup_of_shot, shot_geometry, trace_chunk
 from jaxlidar.trace.device_scene import aim_at, build_device_scene
 from jaxlidar.trace.first_order import first_order
-from jaxlidar.trace.footprint import RaySlice, fibonacci_disc, make_beam
+from jaxlidar.trace.footprint import RaySlice, fibonacci_disc, interleaving_shifts, make_beam
 from jaxlidar.trace.lattices_of_shots import LatticeParts, add_parts, empty_tally, lattice_sums
 from tests.helpers import BY_PRECISION
 
@@ -49,6 +49,52 @@ def test_slices_of_a_lattice_make_up_that_lattice(precision):
     turn = 2 * np.pi * ((number * (np.sqrt(5.0) - 1) / 2) % 1.0 + 0.8)
     angle = np.angle(np.exp(1j * (np.arctan2(distant[1], distant[0]) - turn)))
     assert np.abs(angle).max() < 1e-4
+
+
+@pytest.mark.parametrize("shift", [(0.0, 0.0), (0.7, 0.4)])
+def test_interleaved_lattices_make_up_a_denser_one(shift: tuple[float, float]):
+    """Their rays enclose energy in equal steps, and turn by one angle; planted: shifts at random do not."""
+    beam, n_lattices, n_rays = make_beam(LIDAR), 8, 16
+
+    def steps(shifts) -> tuple[np.ndarray, np.ndarray]:
+        """Return the largest deviations from equal steps of enclosed energy, and of turns."""
+        rays = np.stack([np.stack(fibonacci_disc(beam, n_rays, s)[0]) for s in jnp.asarray(shifts)], axis=1)
+        (x, y), radius = rays.reshape(2, -1), float(beam.radius)
+        enclosed, turn = 1.0 - np.exp(-2.0 * (x**2 + y**2) / radius**2), np.arctan2(y, x) / (2 * np.pi)
+        order = np.argsort(enclosed)
+        energy_steps, turns = np.diff(enclosed[order]), np.diff(turn[order])
+        of_first = np.abs((turns - turns[0] + 0.5) % 1.0 - 0.5)
+        return np.abs(energy_steps * n_lattices * n_rays - 1.0).max(), of_first.max()
+
+    assert max(steps(interleaving_shifts(jnp.asarray(shift), n_lattices))) < 1e-3
+    assert min(steps(np.random.default_rng(0).uniform(size=(n_lattices, 2)))) > 0.1
+
+
+@pytest.mark.slow
+def test_interleaved_lattices_miss_less_than_independent_ones():
+    """Of the fraction of a beam behind an edge, the scatter of lattices bounds the error of their mean."""
+    beam, random = make_beam(LIDAR), np.random.default_rng(1)
+    radius = float(beam.radius)
+    # (trials, lattices, rays): x across the beam, and an edge at random in each trial.
+    edges = random.uniform(-0.6, 0.6, 4000)[:, None, None] * radius
+    shifts = {
+        "interleaved": jax.vmap(lambda s: interleaving_shifts(s, 8))(
+            jnp.asarray(random.uniform(size=(4000, 2)))
+        ),
+        "independent": jnp.asarray(random.uniform(size=(4000, 8, 2))),
+    }
+    exact = np.asarray(jax.scipy.stats.norm.cdf(edges[:, 0, 0] / (0.5 * radius)))
+    squares = {}
+    for name, lattices in shifts.items():
+        x = jax.vmap(jax.vmap(lambda s: fibonacci_disc(beam, 16, s)[0][0]))(lattices)
+        fractions = np.mean(np.asarray(x) < edges, axis=2)
+        scatter = fractions.var(axis=1, ddof=1).mean() / 8
+        squares[name] = np.mean((fractions.mean(axis=1) - exact) ** 2), scatter
+    interleaved, independent = squares["interleaved"], squares["independent"]
+    assert interleaved[0] < 0.5 * independent[0]
+    assert interleaved[0] < 0.5 * interleaved[1]
+    # Of independent ones the scatter is the squared error.
+    assert 0.9 < independent[0] / independent[1] < 1.1
 
 
 @pytest.mark.slow
