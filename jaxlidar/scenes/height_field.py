@@ -38,7 +38,7 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxlidar._checks import concrete_array
 from jaxlidar._mesh_axes import vary_together
 from jaxlidar._one_function import once
-from jaxlidar._vectors import FAR, Scalar, Vec, along, dot, normalise, vec
+from jaxlidar._vectors import FAR, Scalar, Vec, along, dot, normalise, vec, with_derivative_of
 from jaxlidar.scenes.raster import Cell, Raster
 from jaxlidar.scenes.shapes import AbstractShape
 
@@ -166,7 +166,8 @@ class HeightField(AbstractShape):
         correction = (clearance - lax.stop_gradient(clearance)) / jnp.minimum(
             approach_rate, -_MIN_APPROACH_RATE
         )
-        return jnp.where(hit, distance - correction, FAR)
+        # Without derivatives, the compiler then leaves the look-up of the slope out.
+        return jnp.where(hit, with_derivative_of(distance, distance - correction), FAR)
 
     def _first_hit(self, x: Vec, w: Vec) -> Scalar:
         """Find the distance to the first point where a ray falls through the surface; without derivatives."""
