@@ -337,6 +337,7 @@ class FirstOrderTracer:
         """Return the row of a material and a history in a tally; an integer where it is that of all rays."""
         if self.n_groups is None:
             return material * self.shape[1] + history
+        assert rays.group is not None
         return material * self.n_groups + rays.group
 
     def seen_energy(self, rays: FootprintRays) -> Scalar:
