@@ -31,6 +31,7 @@ CHOSEN = {
     "peak_detectors": 0,
     "hectare": 1,
     "strip": 3,
+    "neural_posterior": 0,
     "recorded_shots": 0,
     "gedi_file": 0,
     "photon_track": 1,
