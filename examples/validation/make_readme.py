@@ -18,8 +18,8 @@ RESULTS = FOLDER / "results"
 ORDER = (
     *("mpmath_plate", "prosail_leaves", "discrete_ordinates", "rami4pilps"),
     *("mitransient_crown", "mitransient_meshes", "mcx_crown"),
-    *("leaf_databases", "recorded_gedi", "recorded_neon", "recorded_riegl", "recorded_flat", "recorded_lvis"),
-    "recorded_clouds",
+    *("leaf_databases", "recorded_gedi", "recorded_posterior", "recorded_neon", "recorded_riegl"),
+    *("recorded_flat", "recorded_lvis", "recorded_clouds"),
 )
 
 HEAD = """# Validation: comparisons with references, and their differences

@@ -181,6 +181,17 @@ def test_recorded_shots_of_gedi(run, shared):
 
 
 @pytest.mark.slow
+def test_learned_posterior_of_recorded_shots(run, shared):
+    """Intervals of 90 % hold what they claim on simulated records."""
+    skip_without("flowjax")
+    (path,) = (shared / "gedi").glob("GEDI01_B_*.h5")
+    record = run("recorded_posterior", path, shared / "gedi" / "level2_answers_60_shots.npz")
+    coverage = [row["here"] for row in record["rows"] if "interval" in row["what"]]
+    assert len(coverage) == 4
+    assert all(0.86 <= share <= 0.94 for share in coverage)
+
+
+@pytest.mark.slow
 def test_recorded_returns_of_neon(run, shared):
     assert holds(run("recorded_neon", shared / "neon" / "neon_harvard_250.npz", "--shots", "20"))
 
