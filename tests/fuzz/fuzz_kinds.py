@@ -186,6 +186,12 @@ def read_lvis_shots(path: Path) -> list[Any]:
     return list(jaxlidar.io.read_lvis_l1b(path))
 
 
+def read_atl08_at_20_m(path: Path) -> Any:
+    import jaxlidar.io
+
+    return jaxlidar.io.read_atl08(path, segment=20.0)
+
+
 def read_pls(path: Path) -> list[Any]:
     return read_pair(path, 0, "read_pulsewaves", small_pulsewaves, ".wvs")
 
@@ -387,6 +393,7 @@ KINDS = {
             ("gedi 2a", "read_gedi_l2a", lambda: small_level_2("2A"), plausible_table),
             ("gedi 2b", "read_gedi_l2b", lambda: small_level_2("2B"), plausible_table),
             ("atl08", "read_atl08", lambda: small_icesat2("write_heights"), plausible_table),
+            ("atl08 at 20 m", "read_atl08_at_20_m", lambda: small_icesat2("write_heights"), plausible_table),
             ("lvis", "read_lvis_shots", small_lvis, plausible_shots),
         )
     },
