@@ -31,7 +31,11 @@ def agreement_of(table, products, prefix):
     """Numbers of how well ground and plant area of good shots agree with the products, and of their ranks."""
     is_good = table[f"{prefix}quality"] == "good"
     numbers = {"good": int(is_good.sum())}
-    for name, product in (("ground", "elev_lowestmode"), ("pai", "pai")):
+    quantities = {"ground": "elev_lowestmode", "pai": "pai", "canopy_top": "elev_highest"}
+    for name, product in quantities.items():
+        # Closed forms have no top of their own: that of the product's rules has no error.
+        if f"{prefix}{name}_stderr" not in table:
+            continue
         estimate, stderr = table[f"{prefix}{name}"], table[f"{prefix}{name}_stderr"]
         difference = (estimate - products[product])[is_good]
         numbers[name] = {
@@ -48,13 +52,21 @@ def sentences_of(name, numbers):
     """Say the numbers of `agreement_of`."""
     ground, area = numbers["ground"], numbers["pai"]
     held = [f"{100 * a['within two standard errors']:.0f} %" for a in (ground, area)]
-    return (
+    text = (
         f"Of the {name}, {numbers['good']} are rated good: their ground differs from the product's by "
         f"{ground['median difference']:+.2f} m in the median, by less than "
         f"{ground['nine in ten below']:.2f} m in nine of ten; plant area by "
         f"{area['median absolute difference']:.2f} in the median, with a rank correlation of "
         f"{area['rank correlation']:.2f}; two standard errors hold {held[0]} and {held[1]}."
     )
+    if "canopy_top" in numbers:
+        top = numbers["canopy_top"]
+        text += (
+            f" Their top differs from the highest return by {top['median difference']:+.2f} m in the median, "
+            f"by less than {top['nine in ten below']:.2f} m in nine of ten; two standard errors hold "
+            f"{100 * top['within two standard errors']:.0f} %."
+        )
+    return text
 
 
 def main(argv=None):

@@ -14,10 +14,15 @@ about it. If GEDI's own rule gives another ground, the fit starts from both, and
 proportion to the signal. Samples in the receiver's tail, which the transmitted pulse does not have, are not
 fitted.
 
-**Errors** are the robust standard errors of the fit (`inversion.fit.uncertainty`), with nothing added. They
-contain neither the fixed reflectances nor what relief within the footprint does to the ground's echo.
+**Errors** are the robust standard errors of the fit (`inversion.fit.uncertainty`), with nothing added but to
+that of the top. They contain neither the fixed reflectances nor what relief within the footprint does to the
+ground's echo. A record hardly tells an all but empty layer from none, and errors that are linear about the
+minimum do not contain that such layers could go. So two standard errors of the top reach from it to the
+underside of the uppermost layer that the record shows: whose density lies two of its standard errors above
+zero.
 """
 
+import dataclasses
 import os
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
@@ -36,8 +41,6 @@ from inversion.metrics.gedi import RECEIVER_SMOOTHING, judge_shot
 from inversion.scene.layered_canopy import LAYERS, LayeredCanopy
 
 CANOPY = LayeredCanopy(clearance=1.0)
-# Orbit, m, and the diameter of the footprint at 1/e^2, m.
-_ALTITUDE, _FOOTPRINT, _APERTURE = 400e3, 25.0, 0.8
 # Samples above and below the reference: of 1 ns, or 0.15 m.
 _ABOVE, _BELOW = 280, 80
 # Noise is correlated over five neighbouring samples: together they have the information of one.
@@ -57,6 +60,8 @@ _SIGNAL_SIGMAS, _TOP_ECHO, _START_HEIGHTS = 3.0, 2.0, (2.0, 38.0)
 _AMBIGUOUS_GROUND, _CHI2_FACTOR = 0.5, 2.0
 # A fitted ground further than this from the mode that it started from is doubtful, m.
 _DOUBTFUL_DISTANCE = 0.5
+# A layer whose density is smaller than this many of its standard errors may be empty.
+_SHOWN_SIGMAS = 2.0
 # Bounds of the gain: fractions of the signal over an apparent reflectance.
 _GAINS = (0.0, 20.0)
 
@@ -102,10 +107,7 @@ class GediFits(NamedTuple):
 
 def lidar_of(pulse: Any) -> jl.Lidar:
     """Return GEDI with the transmitted pulse of a shot."""
-    divergence = _FOOTPRINT / _ALTITUDE * 1e3
-    return jl.Lidar(
-        altitude=_ALTITUDE, divergence=divergence, aperture=_APERTURE, pulse=pulse, jitter=RECEIVER_SMOOTHING
-    )
+    return dataclasses.replace(jl.instrument("GEDI coverage"), pulse=pulse, jitter=RECEIVER_SMOOTHING)
 
 
 def canopy_unknowns() -> list[Unknown]:
@@ -316,7 +318,10 @@ def _store(fits: GediFits, i: int, prepared: PreparedShot, retrievals: Retrieval
         "ground": prepared.reference + values["ground"],
         "ground_stderr": stderr["ground"],
         "canopy_top": prepared.reference + values["ground"] + values["canopy height"],
-        "canopy_top_stderr": _propagated(by_top, covariance, values),
+        "canopy_top_stderr": np.hypot(
+            _propagated(by_top, covariance, values),
+            _top_error(density, density * stderr["log density"], float(depth) / LAYERS),
+        ),
         "slope": values["slope"],
         "slope_stderr": stderr["slope"],
         "pai": depth * np.mean(density),
@@ -331,6 +336,19 @@ def _store(fits: GediFits, i: int, prepared: PreparedShot, retrievals: Retrieval
     fits.elevation[i] = prepared.elevation
     fits.signal[i] = prepared.signal * prepared.total
     fits.fitted[i] = values["scale"] * retrievals.fitted[number, 0] * prepared.total
+
+
+def _top_error(
+    density: Float[np.ndarray, " layers"], stderr: Float[np.ndarray, " layers"], thickness: float
+) -> float:
+    """Return half of the distance in m from the top to the underside of the uppermost layer that is shown.
+
+    **Arguments:** `density`, `stderr`: of the layers from below. `thickness`: of a layer in m. Without any
+    layer that is shown, the distance is that to the underside of all.
+    """
+    (shown,) = np.nonzero(density >= _SHOWN_SIGMAS * stderr)
+    number_of_layers = density.size - (shown[-1] if shown.size else 0)
+    return 0.5 * thickness * number_of_layers
 
 
 def _robust_covariance(retrievals: Retrievals, number: int) -> Float[np.ndarray, "n n"]:

@@ -162,7 +162,8 @@ def gedi_table(
 
     - `fit_ground`, `fit_canopy_top`, `fit_slope`, `fit_pai` (of the layers), and `fit_plant_area_density`
       (shots, 10) of ten layers of equal thickness from 1 m above `fit_ground` to `fit_canopy_top`, each with
-      `..._stderr`, the robust standard error of the fit with nothing added;
+      `..._stderr`, the robust standard error of the fit. To that of the top is added that upper layers may be
+      empty: two standard errors reach down to the underside of the uppermost layer that the record shows;
     - `fit_reduced_chi2`;
     - `fit_quality` and `fit_reasons`: of record and fit, about the ground. A shot that cannot be fitted is
       bad and has NaN.
@@ -170,11 +171,12 @@ def gedi_table(
     They compile for about a minute, and then take about a second of one core each.
 
     The closed forms are the first choice: `examples/validation` compares both with the products. The fitted
-    ground is low, by 0.08 m in the median of 44 good fits of a savanna and by 0.32 m or more in a tenth. The
+    ground is low, by 0.08 m in the median of 43 good fits of a savanna and by 0.32 m or more in a tenth. The
     likely cause is relief: it gives the ground's echo shoulders, which a plane under plants explains by low
     plants, with the ground below them. Two standard errors hold the product's ground in 84 % and its plant
-    area in 61 % of them. `fit_canopy_top` lies up to some metres above the plants where the uppermost layers
-    are all but empty, which its standard error does not tell.
+    area in 60 % of them. `fit_canopy_top` lies up to some metres above the plants where the uppermost layers
+    are all but empty: its two standard errors hold the product's highest return in 95 % of them, and the true
+    top in more than nine of ten simulated shots.
 
     **Warns:** `jaxlidar.io.FileWarning` for beams that cannot be read.
 

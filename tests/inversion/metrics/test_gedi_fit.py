@@ -9,16 +9,16 @@ from inversion.scene.layered_canopy import LAYERS
 from jaxlidar.io import read_gedi_l1b
 from tests.inversion.metrics.test_gedi_table import RECORD, STEP, shot
 
-# Recorded shots, and the fits that they had before the fits became a part of the package.
+# Recorded shots, and their fits.
 SHOTS = (19640119100108615, 19641102700108384)
 EXPECTED = {
-    "fit_ground": ((797.8226, 791.1646), 1e-3),
-    "fit_ground_stderr": ((0.07104, 0.13487), 1e-3),
-    "fit_canopy_top": ((801.1945, 797.6886), 1e-2),
-    "fit_slope": ((6.2812, 18.2170), 1e-2),
-    "fit_slope_stderr": ((0.8702, 1.7250), 1e-2),
-    "fit_pai": ((0.14448, 0.20031), 1e-3),
-    "fit_reduced_chi2": ((0.16063, 0.98146), 1e-3),
+    "fit_ground": ((797.8091, 791.1763), 1e-3),
+    "fit_ground_stderr": ((0.08405, 0.14328), 1e-3),
+    "fit_canopy_top": ((802.6498, 799.3462), 1e-2),
+    "fit_slope": ((6.7214, 19.8457), 1e-2),
+    "fit_slope_stderr": ((1.0744, 1.9491), 1e-2),
+    "fit_pai": ((0.16194, 0.19394), 1e-3),
+    "fit_reduced_chi2": ((0.16939, 0.91020), 1e-3),
 }
 
 
@@ -79,6 +79,18 @@ def test_errors_of_sums_need_the_covariance():
     covariance[0, 1] = covariance[1, 0] = -1.0
     stderr = gedi_fit._propagated({"a": 1.0, "b": np.array([1.0, 0.0])}, covariance, values)
     assert stderr == pytest.approx(np.sqrt(1.0 + 4.0 - 2.0))
+
+
+def test_the_top_is_uncertain_by_the_layers_that_may_be_empty():
+    density, stderr = np.full(LAYERS, 0.1), np.full(LAYERS, 0.01)
+    # The underside of the uppermost layer, one below the top; then of the third from above.
+    assert gedi_fit._top_error(density, stderr, 2.0) == pytest.approx(1.0)
+    stderr[-2:] = 0.06
+    assert gedi_fit._top_error(density, stderr, 2.0) == pytest.approx(3.0)
+    # An empty layer between full ones tells nothing of the top.
+    stderr[3] = 1.0
+    assert gedi_fit._top_error(density, stderr, 2.0) == pytest.approx(3.0)
+    assert gedi_fit._top_error(density, np.full(LAYERS, 1.0), 2.0) == pytest.approx(0.5 * 2.0 * LAYERS)
 
 
 # -- columns -----------------------------------------------------------------------------------------------
@@ -178,6 +190,36 @@ def test_fits_of_a_made_up_canopy(tmp_path):
     assert all(p.stage == "shots" for p in repeated_stages)
     for name in names_of_fit():
         np.testing.assert_array_equal(repeated[name], table[name])
+
+
+def canopy_shot(number, random):
+    """A shot of a canopy that is even, thins out upwards, or is thin in its upper part; and its top."""
+    top, cover = random.uniform(6.0, 32.0), random.uniform(0.1, 0.7)
+    base = random.uniform(1.0, 0.4 * top)
+    height = 60.0 - STEP * np.arange(900)
+    level = (height - base) / (top - base)
+    shapes = (np.ones(900), 1.0 - level, np.where(level > 0.6, 0.25, 1.0))
+    target = np.where((level > 0.0) & (level < 1.0), shapes[number % 3], 0.0)
+    target *= cover / target.sum()
+    target[np.argmin(np.abs(height))] += 1.0 - cover
+    return shot(number, random=random, target=target), 100.0 + top
+
+
+@pytest.mark.slow
+def test_errors_of_the_top_hold_and_those_of_the_fit_alone_do_not():
+    random = np.random.default_rng(5)
+    shots, tops = zip(*(canopy_shot(number, random) for number in range(24)))
+    table = inversion.gedi_table(shots, fit=True)
+    is_good = table["fit_quality"] == "good"
+    assert is_good.sum() >= 18
+    error, stderr = table["fit_canopy_top"] - tops, table["fit_canopy_top_stderr"]
+    assert np.mean(np.abs(error)[is_good] <= 2.0 * stderr[is_good]) >= 0.9
+    # Negative control: without what is added for layers that may be empty.
+    thickness = (table["fit_canopy_top"] - table["fit_ground"] - gedi_fit.CANOPY.clearance) / LAYERS
+    layers = (table["fit_plant_area_density"], table["fit_plant_area_density_stderr"], thickness)
+    added = np.array([gedi_fit._top_error(*row) for row in zip(*layers)])
+    own = np.sqrt(np.maximum(stderr**2 - added**2, 0.0))
+    assert np.mean(np.abs(error)[is_good] <= 2.0 * own[is_good]) < 0.7
 
 
 @pytest.mark.slow

@@ -14,13 +14,17 @@ STEP = 0.15
 RECORD = "gedi/GEDI01_B_2019108080338_O01964_T05337_02_003_01_sub.h5"
 
 
-def shot(number=1, *, bins=900, random=None, noise=3.0, cover=0.5, **changes):
-    """A canopy from 4 to 16 m over flat ground at 100 m, of 17,500 counts; noise is smoothed as recorded."""
+def shot(number=1, *, bins=900, random=None, noise=3.0, cover=0.5, target=None, **changes):
+    """A canopy from 4 to 16 m over flat ground at 100 m, of 17,500 counts; noise is smoothed as recorded.
+
+    `target`: shares of the counts in the samples, in place of those of this canopy.
+    """
     elevation = 160.0 - STEP * np.arange(bins)
     height = elevation - 100.0
-    target = np.where((height > 4.0) & (height < 16.0), 1.0, 0.0)
-    target *= cover / target.sum()
-    target[np.argmin(np.abs(height))] += 1.0 - cover
+    if target is None:
+        target = np.where((height > 4.0) & (height < 16.0), 1.0, 0.0)
+        target *= cover / target.sum()
+        target[np.argmin(np.abs(height))] += 1.0 - cover
     record = 200.0 + 17500.0 * np.convolve(target, PULSE / PULSE.sum(), mode="same")
     if random is not None:
         kernel = np.exp(-0.5 * (np.arange(-8, 9) / 1.7) ** 2)
