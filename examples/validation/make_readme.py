@@ -19,7 +19,7 @@ ORDER = (
     *("mpmath_plate", "prosail_leaves", "discrete_ordinates", "rami4pilps"),
     *("mitransient_crown", "mitransient_meshes", "mcx_crown"),
     *("leaf_databases", "recorded_gedi", "recorded_posterior", "recorded_neon", "recorded_riegl"),
-    *("recorded_flat", "recorded_lvis", "recorded_clouds"),
+    *("recorded_flat", "recorded_lvis", "recorded_clouds", "recorded_photons"),
 )
 
 HEAD = """# Validation: comparisons with references, and their differences

@@ -1,5 +1,6 @@
 """The scripts of `examples/validation` run end to end, and their page is made from their records."""
 
+import dataclasses
 import importlib.util
 import json
 import subprocess
@@ -238,3 +239,20 @@ def test_airborne_clouds(run, shared):
         module.PULSE = 1.5
 
     assert not holds(run("recorded_clouds", als / "gedi_simulator.npz", als / "megaplot.laz", planted=plant))
+
+
+@pytest.mark.slow
+def test_recorded_photons_of_icesat2(run, shared):
+    """The ground holds by its errors; not that of a track that is 2 m too high."""
+    paths = [shared / "icesat2" / name for name in ("atl03_half.h5", "atl08_half.h5")]
+    record = run("recorded_photons", *paths)
+    assert holds(record, "ground")
+    assert holds(record, "where the product has one")
+    assert record["agreement"]["ground"]["median absolute difference"] < 0.3
+    assert record["agreement"]["ground, good"]["largest"] < 2.0
+
+    def plant(module):
+        read = module.read_atl03
+        module.read_atl03 = lambda path: dataclasses.replace(read(path), height=read(path).height + 2.0)
+
+    assert not holds(run("recorded_photons", *paths, planted=plant), "ground")
