@@ -228,8 +228,10 @@ def test_a_recorded_track_agrees_with_the_product(shared):
     assert np.nanmax(np.abs(ground[heights.quality == "good"])) < 2.0
     has_canopy = np.isfinite(product["canopy"])
     assert np.isfinite(heights.canopy[has_canopy]).mean() >= 0.8
-    # Three of the seven heights of the product are single photons, as many as the background gives.
-    assert np.nanmedian(np.abs(canopy)) < 1.5
+    assert np.nanmedian(np.abs(canopy + ground)) < 1.0
+    # Of seven heights above the ground, four differ by more than a metre: the product's lie three times at
+    # photons no denser than the background, and once the two grounds differ.
+    assert np.nanmedian(np.abs(canopy)) < 1.2
     assert heights.label.shape == (len(track),)
     # Canopy is not made of background: few of its photons are those that the product calls noise.
     assert np.mean(track.confidence[heights.label == 2] <= 0) < 0.35
