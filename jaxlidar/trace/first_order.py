@@ -300,7 +300,7 @@ class FirstOrderTracer:
 
     def smooth(self, tally: FirstOrderTally) -> FirstOrderTally:
         """Smooth what the medium returns, step 5, once for all rays; surfaces return light at an instant."""
-        n_rows = self.n_medium_materials * (tally.returned.shape[0] // self.shape[0])
+        n_rows = self.n_medium_materials * tally.escaped.shape[0]
         if n_rows == 0:
             return tally
         returned, slopes = tally.returned, tally.slopes
