@@ -795,7 +795,6 @@ ENTRY_POINTS: dict[str, Callable[[], EntryPoint]] = {
             "percentile": 98.0,
             "background_rate": 1.0,
             "least": 5,
-            "footprint": 2.75,
         },
     ),
     "inversion.clumped_leaves": lambda: EntryPoint(

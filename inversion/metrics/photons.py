@@ -8,12 +8,11 @@ r"""Ground and canopy in the events of a photon counter, without a model of the 
        b + N_g g(h - z) + sum_k N_k c_k(h - z)
 
    with the background b, the Gaussian g of the ground's echo and hat functions c_k above it, which make up a
-   canopy of any profile. A slope spreads both over the heights that the footprint meets on it. For each z the
-   numbers N are those that maximise the likelihood, with a Dirichlet prior that the ground is not without
-   light (expectation maximisation). Ground heights of neighbouring cells differ as a Laplace distribution
-   with rare jumps: a hidden Markov model, whose forward-backward recursion gives mean and standard deviation
-   of the ground in each cell. It is run twice, about the smoothed surface of the pass before, so that the
-   ground may bend.
+   canopy of any profile. For each z the numbers N are those that maximise the likelihood, with a Dirichlet
+   prior that the ground is not without light (expectation maximisation). Ground heights of neighbouring cells
+   differ as a Laplace distribution with rare jumps: a hidden Markov model, whose forward-backward recursion
+   gives mean and standard deviation of the ground in each cell. It is run twice, about the smoothed surface
+   of the pass before, so that the ground may bend.
 3. **Signal.** The neighbours of a photon are those within an ellipse along the ground that is wider than high
    (Zhang and Kerekes 2015). By background alone their number is Poisson distributed. A photon is signal where
    that number or more occur in less than one case of ten thousand (compare DRAGANN, Neuenschwander and
@@ -56,10 +55,10 @@ _SURFACE_CELL, _SURFACE_STEP, _SLAB, _SURFACE_CHANGE = 20.0, 1.0, 4, 4.0
 _CENTRING_PASSES = 3
 # Least log-likelihood ratio of a slab with light, and the weight of cells without any in smooth surfaces.
 _LEAST_EVIDENCE, _EMPTY_WEIGHT = 5.0, 1e-3
-# Ground: length of the cells in m; standard deviations in m of the echo on level ground, and the least of
-# what a slope adds, which must not be zero; middles of the hat functions in m above the ground; strength of
-# the prior; iterations of expectation maximisation.
-_GROUND_CELL, _ECHO_WIDTH, _LEAST_SPREAD = 10.0, 0.3, 0.01
+# Ground: length of the cells in m; standard deviation of the echo on level ground and radius (one standard
+# deviation) of the footprint, which widens it on slopes; middles of the hat functions in m above it; strength
+# of the prior; iterations of expectation maximisation.
+_GROUND_CELL, _ECHO_WIDTH, _FOOTPRINT = 10.0, 0.3, 2.75
 _HATS, _GROUND_PRIOR, _EXPECTATIONS = (1.5, 3.5, 7.0, 14.0, 28.0), 0.2, 25
 # Offsets from the surface in m that are tried in the two passes: lowest, highest, step.
 _OFFSETS = ((-40.0, 3.0, 0.25), (-4.0, 4.0, 0.1))
@@ -68,15 +67,18 @@ _GROUND_CHANGE, _JUMP = 0.3, 1e-4
 # Length in m over which surfaces are smoothed between the passes, and the standard error in m at which a
 # height has half of its weight.
 _SMOOTHING_LENGTH, _CERTAIN_ERROR = 30.0, 0.5
-# Largest distance of ground photons from the ground, and least height of canopy above it, in standard
-# deviations of the ground's echo; the latter is also at least so many m.
-_RANGE_SIGMAS, _CLEARANCE_SIGMAS, _CANOPY_CLEARANCE = 2.5, 3.0, 1.0
-# Error of the ground in m beside that of the recursion, on open ground. Larger errors than the limit make
-# a ground doubtful, and so do fewer photons than these.
-_MODEL_ERROR, _DOUBTFUL_ERROR, _DOUBTFUL_PHOTONS = 0.1, 0.7, 3
-# Depths in m below the ground between which photons are counted, and the segments on either side that are
-# counted with each.
-_LEAST_DEPTH, _MOST_DEPTH, _DEPTH_NEIGHBOURS = 1.0, 12.0, 2
+# Largest distance of ground photons from the ground in m, and least height of canopy above it, which is also
+# this many standard deviations of the ground's echo.
+_GROUND_RANGE, _CANOPY_CLEARANCE, _CLEARANCE_SIGMAS = 0.75, 1.0, 3.0
+# Height of a canopy on a slope, in standard deviations of the echo of bare ground, up to which it may be that
+# echo: six from end to end, and strays of the background.
+_BARE_SIGMAS = 10.0
+# Errors of the ground in m beside that of the recursion: on open ground, and more at most under a canopy that
+# goes on down to it. Larger errors than the limit make a ground doubtful, and so do fewer photons than these.
+_MODEL_ERROR, _CANOPY_ERROR, _DOUBTFUL_ERROR, _DOUBTFUL_PHOTONS = 0.1, 0.3, 0.7, 3
+# Depths in m below the ground in which photons are counted, and the segments on either side that are counted
+# with each.
+_DEPTH_RANGE, _DEPTH_NEIGHBOURS = (1.0, 12.0), 2
 # Signal photons in a segment, over the fewest of a ground, with which its lower edge is the ground.
 _RICH_SIGNAL = 4.0
 # Length in m of the segments of ATL03. Segments that are printed.
@@ -142,14 +144,15 @@ def photon_ground_and_canopy(
     percentile: float = 98.0,
     background_rate: float | None = None,
     least: int = 5,
-    footprint: float = 2.75,
 ) -> PhotonHeights:
     """Return ground and canopy height along a track of photon events, by the density of photons.
 
     The method uses neither pulse nor dead time: where echoes are strong, both heights have the bias of first
     photons. The few photons of a thin top are lost with the noise, so canopies read low by a metre or so
     under sunlight. Light is taken to travel straight down. Under a canopy that lets hardly any photon reach
-    the ground, the ground is the lower edge of what returns, and its quality "doubtful".
+    the ground, the ground is the lower edge of what returns, and its quality "doubtful". On slopes of more
+    than 6 degrees the echo of bare ground is wider than this model has it: with several photons in a pulse
+    its upper half passes for low plants, over a ground that is a metre low or more, and both are "doubtful".
 
     **Arguments:**
 
@@ -164,8 +167,6 @@ def photon_ground_and_canopy(
       record about each place, which then must be mostly background: see `PhotonCounter.window`.
     - `least`: fewest photons of a canopy, an integer of at least 2. Default 5. A ground needs three, and more
       than the background gives.
-    - `footprint`: its radius in m (one standard deviation of a Gaussian), not negative. On slopes it widens
-      the ground's echo. Default 2.75, a quarter of the diameter of 11 m at 1/e^2 that ICESat-2 has.
 
     **Returns:** a `PhotonHeights`.
 
@@ -192,7 +193,6 @@ def photon_ground_and_canopy(
     check_range("segment", segment, 0.0, low_open=True)
     check_range("percentile", percentile, 0.0, 100.0)
     least = check_integer("least", least, 2)
-    check_range("footprint", footprint, 0.0)
     if background_rate is not None:
         check_range("background_rate", background_rate, 0.0)
     if isinstance(events, PhotonTrack):
@@ -215,7 +215,7 @@ def photon_ground_and_canopy(
 
     surface = _dense_surface(photons)
     background = _local_background(photons, surface)
-    curve = _ground_curve(photons, surface, background, footprint)
+    curve = _ground_curve(photons, surface, background)
     above = photons.z - curve.height_at(photons.x)
     expected = background.density_at(middle)
     slope = curve.slope_at(middle, lengths)
@@ -223,17 +223,16 @@ def photon_ground_and_canopy(
 
     # Ground: more photons in its echo than the background gives.
     n_segments = starts.size
-    echo_width = np.hypot(_ECHO_WIDTH, footprint * slope)
-    ground_range = _RANGE_SIGMAS * echo_width
-    is_near = np.abs(above) <= ground_range[number]
+    is_near = np.abs(above) <= _GROUND_RANGE
     near = np.bincount(number[is_near], minlength=n_segments)
-    by_background = expected * lengths * 2.0 * ground_range
+    by_background = expected * lengths * 2.0 * _GROUND_RANGE
     fewest = np.maximum(stats.poisson.isf(_FALSE_GROUND, by_background) + 1.0, _DOUBTFUL_PHOTONS)
-    signal_count = np.bincount(number[is_signal & (above > -ground_range[number])], minlength=n_segments)
+    signal_count = np.bincount(number[is_signal & (above > -_GROUND_RANGE)], minlength=n_segments)
     # Below a canopy of many photons the lower edge counts as ground, if a doubtful one.
     has_ground = (near >= fewest) | (signal_count >= _RICH_SIGNAL * fewest)
 
     # Canopy: what clears the ground's echo, and is more than the background gives.
+    echo_width = np.hypot(_ECHO_WIDTH, _FOOTPRINT * slope)
     clearance = np.maximum(_CANOPY_CLEARANCE, _CLEARANCE_SIGMAS * echo_width)
     # A height over the ground needs some photon of the ground.
     is_canopy = is_signal & (above >= clearance[number]) & (has_ground & (near >= 1))[number]
@@ -248,18 +247,21 @@ def photon_ground_and_canopy(
     label = np.select([is_ground, is_canopy, is_signal], [_GROUND, _CANOPY, _OTHER_SIGNAL], _NOISE)
 
     # A canopy that goes on down to the ground hides its echo: where as many photons lie just above the echo
-    # as in it, the ground may be a part of that layer, and is uncertain by the width of its echo.
-    is_just_above = (above > ground_range[number]) & (above <= 3.0 * ground_range[number])
+    # as in it, the ground may be a part of that layer.
+    is_just_above = (above > _GROUND_RANGE) & (above <= 3.0 * _GROUND_RANGE)
     just_above = np.bincount(number[is_just_above], minlength=n_segments)
     excess = np.maximum(just_above - by_background, 0.0) / np.maximum(near, 1)
-    model_error = _MODEL_ERROR + echo_width * np.minimum(excess, 1.0)
+    model_error = _MODEL_ERROR + _CANOPY_ERROR * np.minimum(excess, 1.0)
     ground_stderr = np.hypot(curve.stderr_at(middle, lengths), model_error)
     # Light from below the ground: there is a deeper one. Segments about each are counted together.
-    depth = np.maximum(_LEAST_DEPTH, _CLEARANCE_SIGMAS * echo_width)
-    is_below = (above < -depth[number]) & (above > -_MOST_DEPTH)
+    is_below = (above < -_DEPTH_RANGE[0]) & (above > -_DEPTH_RANGE[1])
     below = _moving_sum(np.bincount(number[is_below], minlength=n_segments), _DEPTH_NEIGHBOURS)
-    depth_background = _moving_sum(expected * lengths * (_MOST_DEPTH - depth), _DEPTH_NEIGHBOURS)
+    depth_background = _moving_sum(expected * lengths, _DEPTH_NEIGHBOURS) * np.ptp(_DEPTH_RANGE)
     is_deeper = below > stats.poisson.isf(_FALSE_DEPTH, depth_background)
+    # The ground is sought by the echo of level ground. On a slope it is wider, and its upper half passes for
+    # low plants over a ground that is too low.
+    is_steep = _FOOTPRINT * np.abs(slope) > _ECHO_WIDTH
+    may_be_bare = is_steep & has_canopy & (height <= _BARE_SIGMAS * echo_width)
     verdicts = [
         _verdict(
             bool(has_ground[i]),
@@ -267,6 +269,7 @@ def photon_ground_and_canopy(
             int(near[i]),
             float(by_background[i]),
             bool(is_deeper[i]),
+            bool(may_be_bare[i]),
         )
         for i in range(n_segments)
     ]
@@ -491,7 +494,7 @@ def _moving_sum(values: np.ndarray, half: int) -> np.ndarray:
 # -- ground ------------------------------------------------------------------------------------------------
 
 
-def _ground_curve(photons: _Photons, surface: _Curve, background: _Background, footprint: float) -> _Curve:
+def _ground_curve(photons: _Photons, surface: _Curve, background: _Background) -> _Curve:
     """Return the ground along the track: step 2 of the module's docstring."""
     number, middle = _cells(photons, _GROUND_CELL)
     order = np.argsort(number, kind="stable")
@@ -503,14 +506,12 @@ def _ground_curve(photons: _Photons, surface: _Curve, background: _Background, f
         # Heights that are not certain bend the smooth surface less.
         weight = np.maximum(support / (1.0 + (stderr / _CERTAIN_ERROR) ** 2), _EMPTY_WEIGHT)
         curve = _Curve(middle, _smoothed(height, weight, length), stderr, weight)
-        slope = curve.slope_at(middle, np.full(middle.size, length))
-        spreads = np.maximum(footprint * np.abs(slope), _LEAST_SPREAD)
         offsets = np.arange(low, high + 0.5 * step, step)
         residual = photons.z - curve.height_at(photons.x)
         evidence = np.stack(
             [
-                _log_likelihood(residual[order[a:b]], offsets, float(density), length, float(spread))
-                for a, b, density, spread in zip(edges[:-1], edges[1:], background.density, spreads)
+                _log_likelihood(residual[order[a:b]], offsets, float(density), length)
+                for a, b, density in zip(edges[:-1], edges[1:], background.density)
             ]
         )
         posterior = _posterior(evidence, offsets)
@@ -536,19 +537,17 @@ def _smoothed(height: np.ndarray, weight: np.ndarray, step: float) -> np.ndarray
     return linalg.solve_banded((2, 2), bands, weight * height)
 
 
-def _log_likelihood(
-    height: np.ndarray, offsets: np.ndarray, background: float, length: float, spread: float
-) -> np.ndarray:
+def _log_likelihood(height: np.ndarray, offsets: np.ndarray, background: float, length: float) -> np.ndarray:
     """Return the log-likelihood of the photons of one cell for each height of the ground, but for a constant.
 
     **Arguments:** `height`: (photons,) m. `offsets`: (offsets,) heights of the ground in m. `background`: per
-    square metre. `length`: of the cell in m. `spread`: of the footprint's heights in m.
+    square metre. `length`: of the cell in m.
     """
     low, high = offsets[0] - 3.0, offsets[-1] + _HATS[-1] * 1.4
     height = height[(height > low) & (height < high)]
     if height.size == 0:
         return np.zeros(offsets.size)
-    shapes = _rate_shapes(height[None, :] - offsets[:, None], spread) / length
+    shapes = _rate_shapes(height[None, :] - offsets[:, None]) / length
     # Numbers of photons of each component, to start from: equal shares of what is not background.
     signal = max(height.size - background * length * (high - low), 1.0)
     numbers = np.full((len(shapes), offsets.size), signal / len(shapes))
@@ -561,30 +560,18 @@ def _log_likelihood(
     return np.log(rate).sum(axis=1) - numbers.sum(axis=0) + prior
 
 
-def _rate_shapes(above: np.ndarray, spread: float) -> np.ndarray:
+def _rate_shapes(above: np.ndarray) -> np.ndarray:
     """Return the densities, of unit integral, of the ground's echo and of the hat functions above it.
 
-    A hat function is a sum of three ramps, and a ramp max(x, 0) over a Gaussian of deviation s is
-    x Phi(x / s) + s phi(x / s).
-
-    **Arguments:** `above`: heights of photons above the ground in m, of any shape. `spread`: standard
-    deviation of the heights that the footprint meets, in m.
+    **Arguments:** `above`: heights of photons above the ground in m, of any shape.
 
     **Returns:** (components, ...) 1/m.
     """
-    width = np.hypot(_ECHO_WIDTH, spread)
-    shapes = [np.exp(-0.5 * (above / width) ** 2) / (width * np.sqrt(2.0 * np.pi))]
+    shapes = [np.exp(-0.5 * (above / _ECHO_WIDTH) ** 2) / (_ECHO_WIDTH * np.sqrt(2.0 * np.pi))]
     nodes = (0.0, *_HATS, 1.4 * _HATS[-1])
-    ramps = []
-    for node in nodes:
-        x = above - node
-        normal = np.exp(-0.5 * (x / spread) ** 2) / np.sqrt(2.0 * np.pi)
-        ramps.append(x * special.ndtr(x / spread) + spread * normal)
-    for k in range(1, len(nodes) - 1):
-        rise, fall = 1.0 / (nodes[k] - nodes[k - 1]), 1.0 / (nodes[k + 1] - nodes[k])
-        hat = rise * ramps[k - 1] - (rise + fall) * ramps[k] + fall * ramps[k + 1]
-        # Rounding of the ramps must not give a negative rate.
-        shapes.append(np.maximum(hat, 0.0) * 2.0 / (nodes[k + 1] - nodes[k - 1]))
+    for left, middle, right in zip(nodes[:-2], nodes[1:-1], nodes[2:]):
+        rise, fall = (above - left) / (middle - left), (right - above) / (right - middle)
+        shapes.append(np.maximum(np.minimum(rise, fall), 0.0) * 2.0 / (right - left))
     return np.stack(shapes)
 
 
@@ -608,7 +595,9 @@ def _posterior(evidence: np.ndarray, offsets: np.ndarray) -> np.ndarray:
     return posterior / posterior.sum(axis=1, keepdims=True)
 
 
-def _verdict(has_ground: bool, stderr: float, near: int, by_background: float, is_deeper: bool) -> Verdict:
+def _verdict(
+    has_ground: bool, stderr: float, near: int, by_background: float, is_deeper: bool, may_be_bare: bool
+) -> Verdict:
     """Return the verdict on the ground of a segment."""
     if not has_ground:
         return Verdict("bad", ("no ground: as many photons as the background gives",))
@@ -619,6 +608,8 @@ def _verdict(has_ground: bool, stderr: float, near: int, by_background: float, i
         verdict &= Verdict("doubtful", (f"{near} photons in the ground's echo",))
     if is_deeper:
         verdict &= Verdict("doubtful", ("photons below the ground",))
+    if may_be_bare:
+        verdict &= Verdict("doubtful", ("steep: the canopy may be the echo of bare ground",))
     return verdict
 
 
