@@ -174,9 +174,9 @@ def setup_optics(setup: Setup) -> Float[Array, "channels wavelengths"]:
     return channel_optics(setup.lidar, setup.scene, setup.plan.config.channels)
 
 
-def make_waveform_model(setup: Setup) -> WaveformModel:
-    """Make the waveform model of a setup, with its sizes as they are."""
-    return _make_model(setup, setup.plan.n_samples, setup.plan.degree)
+def make_waveform_model(setup: Setup, *, as_band: bool = False) -> WaveformModel:
+    """Make the waveform model of a setup, with its sizes as they are; `as_band`: see `pulse_convolution`."""
+    return _make_model(setup, setup.plan.n_samples, setup.plan.degree, as_band=as_band)
 
 
 def make_padded_waveform_model(setup: Setup) -> WaveformModel:
@@ -191,7 +191,7 @@ def make_padded_waveform_model(setup: Setup) -> WaveformModel:
     return model.padded_to(max(size_bucket(n_wavelengths), MIN_WAVELENGTHS))
 
 
-def _make_model(setup: Setup, n_samples: int, degree: int) -> WaveformModel:
+def _make_model(setup: Setup, n_samples: int, degree: int, *, as_band: bool = False) -> WaveformModel:
     """Make the waveform model of a setup.
 
     1. The convolution with the pulse.
@@ -199,7 +199,7 @@ def _make_model(setup: Setup, n_samples: int, degree: int) -> WaveformModel:
     3. The optics of all channels, and the degrees of histories: 0 where optics are applied by the tracer.
     """
     lidar, plan, atmosphere = setup.lidar, setup.plan, setup.scene.atmosphere
-    convolution, bins = pulse_convolution(lidar, plan, n_samples), plan.bins
+    convolution, bins = pulse_convolution(lidar, plan, n_samples, as_band=as_band), plan.bins
     bin_start, bin_width = (as_array(a) for a in (bins.start, bins.width))
     transmittance = air_return = air_relative_energy = None
     if atmosphere is not None:

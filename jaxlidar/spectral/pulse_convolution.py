@@ -5,7 +5,7 @@ A return in the fine bin at t_i adds to the sample at t_s, of the width D, the f
     F(t_s - t_i + D/2) - F(t_s - t_i - D/2),   F(t) = integral of the pulse's power up to t,
 
 which depends on t_s - t_i alone. It is applied as a matrix of fine bins and samples where that is small, else
-as a strided convolution with a band.
+as a band: samples in tiles, each of which takes from two blocks of fine bins, by one matrix for all tiles.
 
 Deposits were spread by a kernel (`jaxlidar.trace.deposit`) of the second moment v = 1/4 bin^2
 (`KERNEL_VARIANCE`). It is taken out again to second order, F - v/2 F'', by fluxes that are limited so that no
@@ -19,12 +19,11 @@ from typing import final
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jax import lax
 from jaxtyping import Array, Float
 
 from jaxlidar._checks import as_array
 from jaxlidar._one_function import once
-from jaxlidar._products import FULL_PRECISION, einsum
+from jaxlidar._products import einsum
 from jaxlidar._programs import Program
 from jaxlidar.instrument.lidar import Lidar
 from jaxlidar.instrument.pulse import AbstractPulse
@@ -39,7 +38,7 @@ class PulseConvolution(eqx.Module):
 
     - `fractions`: of a return that samples receive, by their offset from the fine bin, in fine bins.
     - `first_offset`: the offset of the first of them.
-    - `n_bins`, `n_samples`, `bins_per_sample`: sizes.
+    - `n_bins`, `n_samples`, `bins_per_sample`: sizes. `is_dense`: True if the map is applied as a matrix.
     """
 
     fractions: Float[Array, "offsets"]
@@ -47,11 +46,7 @@ class PulseConvolution(eqx.Module):
     n_bins: int = eqx.field(static=True)
     n_samples: int = eqx.field(static=True)
     bins_per_sample: int = eqx.field(static=True)
-
-    @property
-    def is_dense(self) -> bool:
-        """True if the map is applied as a matrix."""
-        return self.n_bins * self.n_samples <= MAX_DENSE_PULSE
+    is_dense: bool = eqx.field(static=True)
 
     def matrix(self) -> Float[Array, "fine samples"]:
         """Return the fraction of a return in fine bin i that each sample receives."""
@@ -67,32 +62,55 @@ class PulseConvolution(eqx.Module):
         return self._convolve(fine)
 
     def _convolve(self, fine: Float[Array, "*s bins"]) -> Float[Array, "*s samples"]:
-        """Apply the band: sample s takes the fine bins s * stride - n, with n the offsets of `fractions`."""
-        stride, last = self.bins_per_sample, self.first_offset + self.fractions.size - 1
-        # Sample 0 begins with bin -last: pad what it lacks, or skip what it does not take.
-        before = max(last, 0)
-        start = before - last
-        length = (self.n_samples - 1) * stride + self.fractions.size
-        after = max(start + length - before - self.n_bins, 0)
-        rows = fine.reshape(-1, 1, fine.shape[-1])
-        rows = jnp.pad(rows, ((0, 0), (0, 0), (before, after)))[..., start : start + length]
-        out = lax.conv_general_dilated(
-            rows, self.fractions[::-1][None, None, :], (stride,), "VALID", precision=FULL_PRECISION
-        )
-        return out.reshape(*fine.shape[:-1], self.n_samples)
+        """Apply the band: sample s takes the fine bins s * stride - n, with n the offsets of `fractions`.
+
+        1. Lay out the fine bins in blocks as long as the samples of a tile. The first block begins with the
+           first bin that sample 0 takes. A tile is at least as long as the band, so that tile t takes from
+           blocks t and t + 1 alone.
+        2. Multiply all blocks by the matrices of both positions.
+        3. Add what each tile takes from its two blocks.
+        """
+        stride, width = self.bins_per_sample, self.fractions.size
+        n_tile = -(-width // stride)
+        block, n_tiles = n_tile * stride, -(-self.n_samples // n_tile)
+        # Step 1. Sample 0 begins with bin -last: pad what it lacks, or skip what it does not take.
+        last = self.first_offset + width - 1
+        before, skipped, length = max(last, 0), max(-last, 0), (n_tiles + 1) * block
+        after = max(skipped + length - before - self.n_bins, 0)
+        padded = jnp.pad(fine, [(0, 0)] * (fine.ndim - 1) + [(before, after)])
+        blocks = padded[..., skipped : skipped + length].reshape(*fine.shape[:-1], n_tiles + 1, block)
+        # Step 2. Optimisation barrier: padding in the product's own kernel takes longer than the product.
+        products = einsum("...b,bps->...ps", once(blocks), self._tile_matrices(n_tile))
+        # Step 3.
+        tiles = products[..., :-1, 0, :] + products[..., 1:, 1, :]
+        return tiles.reshape(*fine.shape[:-1], n_tiles * n_tile)[..., : self.n_samples]
+
+    def _tile_matrices(self, n_tile: int) -> Float[Array, "block 2 tile"]:
+        """Return the fraction of each bin of the two blocks of a tile that each of its samples receives."""
+        block, width = n_tile * self.bins_per_sample, self.fractions.size
+        bins = np.arange(block)[:, None, None] + block * np.arange(2)[None, :, None]
+        number = np.arange(n_tile)[None, None, :] * self.bins_per_sample - bins + width - 1
+        in_band = (number >= 0) & (number < width)
+        fractions = once(self.fractions)[np.clip(number, 0, width - 1)]
+        # Optimisation barriers as in `matrix`.
+        return once(jnp.where(in_band, fractions, 0.0))
 
 
-def pulse_convolution(lidar: Lidar, plan: Plan, n_samples: int | None = None) -> PulseConvolution:
+def pulse_convolution(
+    lidar: Lidar, plan: Plan, n_samples: int | None = None, *, as_band: bool = False
+) -> PulseConvolution:
     """Make the convolution of a lidar's pulse with its digitiser's first `n_samples` samples.
 
-    Default None: as many as the plan has.
+    Default None: as many as the plan has. `as_band`: True for a band whatever the size. It takes less time,
+    but programs are compiled for the width of the pulse.
     """
     # Offsets between a sample's centre and a fine bin's, in fine bins, from the last bin to the first.
     bins, bins_per_sample, n_samples = plan.bins, plan.bins_per_sample, n_samples or plan.n_samples
     # That of the first sample's centre from the first bin's.
     first_sample = (plan.sample_start - bins.start) / bins.width
     low, high = -(bins.count - 1), (n_samples - 1) * bins_per_sample
-    if bins.count * n_samples > MAX_DENSE_PULSE:
+    is_dense = not as_band and bins.count * n_samples <= MAX_DENSE_PULSE
+    if not is_dense:
         # A band as wide as the pulse.
         half = 0.5 * plan.sample_interval
         low = max(low, math.floor((plan.pulse_support[0] - half) / bins.width - first_sample) - 2)
@@ -101,7 +119,7 @@ def pulse_convolution(lidar: Lidar, plan: Plan, n_samples: int | None = None) ->
     edge_offset = np.arange(low - 1, high + bins_per_sample + 2) - 0.5 * bins_per_sample
     edges = as_array((edge_offset + first_sample) * bins.width)
     fractions = _compiled_fractions(lidar.pulse, lidar.jitter, edges, KERNEL_VARIANCE, bins_per_sample)
-    return PulseConvolution(fractions, low, bins.count, n_samples, bins_per_sample)
+    return PulseConvolution(fractions, low, bins.count, n_samples, bins_per_sample, is_dense)
 
 
 def _sample_fractions(

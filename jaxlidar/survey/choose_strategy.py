@@ -44,6 +44,8 @@ _PHOTONS_DIVISOR, _RAYS_DIVISOR = 4.0, 2.0
 _PHOTONS_DIVISOR_OF_SHOT_TALLIES = 1.0
 # Sharing pays where so many footprints overlap in the mean, by either tally, and shots are so many.
 _MIN_OVERLAP, _MIN_OVERLAP_OF_SHOT_TALLIES, _MIN_SHOTS = 1.3, 2.0, 4
+# A few rays resolve the edges of voxels in footprints that meet so many columns of them (see `per_shot`).
+_COLUMNS_WITH_FEW_EDGES = 2.0
 # Numbers of rays and of photons of a batch are powers of two in these ranges: surveys share compiled
 # programs.
 _RAYS, _PHOTONS = (64, 4096), (256, 8192)
@@ -68,7 +70,8 @@ def choose_strategy(
     # Eight batches then have 6.4 / rtol^2 photons, before these are rounded and bounded: a sample with a
     # sixth of the light has the relative error rtol.
     n_photons = _power_of_two(0.8 / rtol**2, *_PHOTONS)
-    plan = plan.with_config(n_rays=_rays_of_batch(plan, survey, scene, rtol), n_photons=n_photons)
+    columns = _columns_of_footprint(plan, survey, scene)
+    plan = plan.with_config(n_rays=_rays_of_batch(plan, columns, rtol), n_photons=n_photons)
     # The setup is that of one shot in the middle of the survey, with the largest zenith angle.
     middle = survey.middle
     setup = make_setup(middle, scene, plan)
@@ -77,26 +80,32 @@ def choose_strategy(
     lidar, _ = move_aim_to_origin(middle, scene)
     relative_survey = survey.about((concrete_array(middle.position) - concrete_array(lidar.position))[:2])
     strategy = _shared_illumination(relative_survey, setup, rtol, kept_names, shared)
-    return PerShotStrategy(setup, relative_survey, rtol, kept_names) if strategy is None else strategy
+    if strategy is not None:
+        return strategy
+    return PerShotStrategy(setup, relative_survey, rtol, kept_names, columns <= _COLUMNS_WITH_FEW_EDGES)
 
 
-def _rays_of_batch(plan: Plan, survey: Survey, scene: Scene, rtol: float) -> int:
+def _columns_of_footprint(plan: Plan, survey: Survey, scene: Scene) -> float:
+    """Return about how many columns of voxels a footprint meets; infinity without voxels, or with meshes."""
+    if scene.canopy is None or scene.meshes:
+        return math.inf
+    edge = float(np.min(concrete_array(scene.canopy.voxels.voxel_size)[:2]))
+    radius = float(np.max(survey.footprint_radius))
+    if survey.has_sensor_position:
+        # The radius is that 1 m ahead of the sensor: the widest footprint is that of the last return.
+        radius *= 0.5 * SPEED_OF_LIGHT * plan.scope.last_return / AIM_DISTANCE
+    return (1.0 + 2.0 * radius / edge) ** 2
+
+
+def _rays_of_batch(plan: Plan, columns: float, rtol: float) -> int:
     """Return the number of rays of a footprint in a batch.
 
-    Enough for the tolerance, and without meshes at most 32 for each column of voxels: more would meet the
-    same voxels.
+    Enough for the tolerance, and at most 32 for each of its `columns` of voxels: more would meet the same
+    voxels.
     """
     # Chosen by trial. If the error of N rays is N^(-3/4) (see `per_shot`), that of eight batches is then 0.2
     # rtol at rtol = 0.01, and less than that at larger ones.
-    rays = 10.0 / rtol
-    if scene.canopy is not None and not scene.meshes:
-        edge = float(np.min(concrete_array(scene.canopy.voxels.voxel_size)[:2]))
-        radius = float(np.max(survey.footprint_radius))
-        if survey.has_sensor_position:
-            # The radius is that 1 m ahead of the sensor: the widest footprint is that of the last return.
-            radius *= 0.5 * SPEED_OF_LIGHT * plan.scope.last_return / AIM_DISTANCE
-        columns = (1.0 + 2.0 * radius / edge) ** 2
-        rays = min(rays, 32.0 * columns)
+    rays = min(10.0 / rtol, 32.0 * columns)
     return min(_power_of_two(rays, *_RAYS), plan.n_rays)
 
 

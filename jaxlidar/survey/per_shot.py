@@ -18,8 +18,11 @@ one of two ways:
 
 Lattices of narrow footprints begin with as few rays as the tolerance allows, and those of several shots are
 traced together (`jaxlidar.trace.lattices_of_shots`). The lattices of a shot interleave: together they are one
-lattice of eight times as many rays, which has no gaps. Their scatter then is an upper bound of the error.
-Shots that are not within the tolerance get more parts, as many as the error of each asks for.
+lattice of eight times as many rays, which has no gaps. If a lattice of N rays has the error c N^-3/4, that of
+all eight is c (8 N)^-3/4. It is 8^-1/4 times what their scatter tells, c N^-3/4 8^-1/2, the standard error of
+the mean of eight independent ones. The former is reported where edges of voxels are few within a footprint,
+so that lattices resolve them; elsewhere the latter, an upper bound. Shots that are not within the tolerance
+get more parts, as many as the error of each asks for.
 """
 
 import dataclasses
@@ -82,10 +85,12 @@ _BATCH_STEPS = StepRule(max_growth=1.0, min_step=4)
 _NARROW_RAYS = 64
 # ... which are traced in parts of so many rays, for so many shots together ...
 _RAYS_OF_PART, _SHOTS_AT_ONCE = 8, 8
-# ... with as many parts in the first round that about five rays of all lattices meet what covers the fraction
-# `rtol` of a footprint. With fewer, shots of which no ray meets an edge of a crown seem exact: by trial
-# over a forest, with half as many rays several times as many shots had an error of more than twice `rtol` ...
-_LEAST_PARTS_TIMES_RTOL = 0.08
+# ... with as many parts in the first round that about three rays of all lattices meet what covers the
+# fraction `rtol` of a footprint. Shots of which no ray meets an edge of a crown seem exact: with fewer rays,
+# too many of them would have an error of more than twice `rtol` ...
+_LEAST_PARTS_TIMES_RTOL = 0.04
+# ... with the error of interleaved lattices over that of as many independent ones, if they resolve edges ...
+_ERROR_OF_INTERLEAVED = MIN_BATCHES**-0.25
 # ... at no more wavelengths than there are histories: the responses of lattices, with optics applied, would
 # be larger.
 _MAX_WAVELENGTHS = 4
@@ -143,7 +148,13 @@ def aim_offset(setup: Setup, shot: ShotGeometry) -> Float[Array, "axes"]:
 
 @dataclasses.dataclass(frozen=True)
 class PerShotStrategy(AbstractStrategy):
-    """Every shot has photons of its own; a task is a chunk of shots."""
+    """Every shot has photons of its own; a task is a chunk of shots.
+
+    - `resolves_edges`: True if so few columns of voxels lie within a footprint that a few rays resolve their
+      edges.
+    """
+
+    resolves_edges: bool
 
     @property
     def shots_per_chunk(self) -> int:
@@ -162,7 +173,7 @@ class PerShotStrategy(AbstractStrategy):
             task(
                 number,
                 trace_chunk,
-                (self.setup, self._chunk_geometry(shots), self.rtol, self.kept_names),
+                (self.setup, self._chunk_geometry(shots), self.rtol, self.kept_names, self.resolves_edges),
                 key,
             )
             for number, shots in enumerate(self.shot_slices)
@@ -193,10 +204,15 @@ class PerShotStrategy(AbstractStrategy):
 
 
 def trace_chunk(
-    setup: Setup, shots: ShotGeometry, rtol: float, kept_names: tuple[str, ...], key: PRNGKeyArray
+    setup: Setup,
+    shots: ShotGeometry,
+    rtol: float,
+    kept_names: tuple[str, ...],
+    resolves_edges: bool,
+    key: PRNGKeyArray,
 ) -> ShotResults:
     """Trace a chunk of shots."""
-    return compiled_shots(setup, shots.as_arrays(), key, jnp.asarray(rtol), kept_names)
+    return compiled_shots(setup, shots.as_arrays(), key, jnp.asarray(rtol), kept_names, resolves_edges)
 
 
 class ShotBatch(NamedTuple):
@@ -230,7 +246,7 @@ def _aim_shot(scene: DeviceScene, setup: Setup, shot: ShotGeometry, key: PRNGKey
     offset = aim_offset(setup, shot)
     # The key follows from the shot's number: its waveform does not depend on chunks or workers.
     setup, key = setup_of_shot(setup, shot), jax.random.fold_in(key, shot.number)
-    return AimedShot(aim_at(scene, setup.lidar, offset), setup, make_waveform_model(setup), key)
+    return AimedShot(aim_at(scene, setup.lidar, offset), setup, make_waveform_model(setup, as_band=True), key)
 
 
 def _trace_shot(
@@ -259,10 +275,15 @@ def _trace_shot(
     return _shot_results(aimed, _densify_lattices(aimed, rtol), kept_names)
 
 
-def _shot_results(aimed: AimedShot, estimate: RunningMoments, kept_names: tuple[str, ...]) -> ShotResults:
-    """Return the results of a shot from the moments of its batches."""
-    waveform_stderr, energy_budget_stderr = estimate.stderr
-    errors = ShotErrors(waveform_stderr, energy_budget_stderr, _relative_error(estimate))
+def _shot_results(
+    aimed: AimedShot, estimate: RunningMoments, kept_names: tuple[str, ...], error_factor: float = 1.0
+) -> ShotResults:
+    """Return the results of a shot from the moments of its batches.
+
+    `error_factor`: standard error over that of batches that are independent.
+    """
+    stderr = jax.tree.map(lambda a: error_factor * a, estimate.stderr)
+    errors = ShotErrors(*stderr, error_factor * _relative_error(estimate))
     mean: ShotBatch = estimate.mean_only
     photons = estimate.count * aimed.setup.plan.photons_traced
     return make_shot_results(aimed.model, *mean, errors, photons=photons, kept_names=kept_names)
@@ -375,6 +396,7 @@ def _trace_narrow_shots(
     key: PRNGKeyArray,
     rtol: Array,
     kept_names: tuple[str, ...],
+    resolves_edges: bool,
 ) -> ShotResults:
     """Trace the lattices of narrow shots, again with more parts for those that are not within the tolerance.
 
@@ -386,6 +408,7 @@ def _trace_narrow_shots(
     """
     n_shots = len(shots.number)
     max_parts = MAX_BATCHES_OR_PARTS * scene.config.n_rays // _RAYS_OF_PART
+    error_factor = _ERROR_OF_INTERLEAVED if resolves_edges else 1.0
     # Not more than where shots are not narrow.
     most = -(-scene.config.n_rays // _RAYS_OF_PART)
     first_parts = jnp.clip(jnp.ceil(_LEAST_PARTS_TIMES_RTOL / rtol), 1, most).astype(jnp.int32)
@@ -395,7 +418,7 @@ def _trace_narrow_shots(
 
     def trace_some(numbers: Array, n_parts: Array) -> ShotResults:
         shots_of_group = jax.tree.map(lambda a: a[numbers], shots)
-        return _trace_together(scene, setup, shots_of_group, n_parts, key, kept_names)
+        return _trace_together(scene, setup, shots_of_group, n_parts, key, kept_names, error_factor)
 
     def next_round(state: tuple[Array, ShotResults]) -> tuple[Array, ShotResults]:
         n_parts, results = state
@@ -430,6 +453,7 @@ def _trace_together(
     n_parts: Int[Array, "*shots"],
     key: PRNGKeyArray,
     kept_names: tuple[str, ...],
+    error_factor: float,
 ) -> ShotResults:
     """Trace the lattices of a group of shots, each in `n_parts` parts.
 
@@ -488,18 +512,23 @@ def _trace_together(
         values = jax.vmap(lambda response: _total_and_budget(response, aimed.model))(responses)
         moments = RunningMoments.of_batches(values, responses)
         batch = ShotBatch.of_response(moments.mean_only, aimed.model)
-        return _shot_results(aimed, moments._replace(mean_only=batch), kept_names)
+        return _shot_results(aimed, moments._replace(mean_only=batch), kept_names, error_factor)
 
     return jax.vmap(results_of)(shots, sums)
 
 
 def _trace_shots(
-    setup: Setup, shots: ShotGeometry, key: PRNGKeyArray, rtol: Array, kept_names: tuple[str, ...]
+    setup: Setup,
+    shots: ShotGeometry,
+    key: PRNGKeyArray,
+    rtol: Array,
+    kept_names: tuple[str, ...],
+    resolves_edges: bool,
 ) -> ShotResults:
     """Trace shots over one device scene."""
     scene = build_device_scene(setup, derivatives="none")
     if _are_narrow(setup, scene):
-        return _trace_narrow_shots(scene, setup, shots, key, rtol, kept_names)
+        return _trace_narrow_shots(scene, setup, shots, key, rtol, kept_names, resolves_edges)
     # Not `vmap`: the loops of all shots together would run until the slowest of them has met its tolerance,
     # and their arrays would not fit into a processor's cache.
     return jax.lax.map(lambda shot: _trace_shot(scene, setup, shot, key, rtol, kept_names), shots)

@@ -284,7 +284,8 @@ def interleaving_shifts(shift: Float[Array, "2"], count: int) -> Float[Array, "l
     the angle a with count a = golden angle, in whole turns and a fraction. Of the angles that fulfil this the
     one is taken whose multiples stay farthest from whole turns. If `shift` is uniform in [0, 1), so is every
     shift: each disc is an unbiased estimate on its own, and their scatter an upper bound of the variance of
-    their mean, which lacks the gaps that discs shifted independently would leave.
+    their mean, which lacks the gaps that discs shifted independently would leave (see
+    `jaxlidar.survey.per_shot`).
     """
     angles = (GOLDEN + np.arange(count)) / count
     multiples = np.arange(1, 8 * count)

@@ -224,8 +224,40 @@ def test_results_do_not_depend_on_which_shots_are_traced_together():
     strategy = strategy_of(narrow_shots(20), edge())
     chunks = [shot_geometry(strategy.survey, first, count) for first, count in ((0, 20), (3, 9))]
     all_shots, nine_shots = (
-        trace_chunk(strategy.setup, chunk, 0.1, strategy.kept_names, KEY) for chunk in chunks
+        trace_chunk(strategy.setup, chunk, 0.1, strategy.kept_names, strategy.resolves_edges, KEY)
+        for chunk in chunks
     )
     assert np.ptp(np.asarray(all_shots.error)) > 0
     np.testing.assert_allclose(all_shots.reflectance[3:12], nine_shots.reflectance, rtol=1e-3, atol=1e-6)
     np.testing.assert_allclose(all_shots.error[3:12], nine_shots.error, rtol=1e-2, atol=1e-5)
+
+
+@pytest.mark.slow
+def test_errors_of_narrow_shots_are_those_of_interleaved_lattices():
+    """Over voxels filled at random, 2 s.e. hold, and hardly a shot is beyond twice the tolerance."""
+    random = np.random.default_rng(3)
+    density = np.where(random.random((20, 20, 8)) < 0.2, 3.0, 0.0)
+    canopy = jl.Canopy(jl.VoxelMap.from_lad(density, voxel_size=1.0), leaf=jl.Prospect(), hotspot=False)
+    scene = terrain_under(jl.Scene(canopy=canopy, ground=jl.Ground(reflectance=0.3)))
+    survey, rtol = jl.Survey(NARROW, random.uniform(2.0, 18.0, (300, 2)), 5.0), 0.05
+    exact = jl.simulate_many(survey, scene, key=jax.random.key(6), max_orders=1, rtol=0.1 * rtol)
+    waveforms = jl.simulate_many(survey, scene, key=KEY, max_orders=1, rtol=rtol)
+    expected, stderr = np.asarray(exact.reflectance), np.asarray(waveforms.stderr)
+    difference = np.asarray(waveforms.reflectance) - expected
+    peak = expected.max(axis=-1, keepdims=True)
+    is_significant = (expected > 0.01 * peak) & (stderr > 0.002 * peak)
+    z = np.abs(difference / np.where(is_significant, stderr, 1.0))[is_significant]
+    assert 0.93 < np.mean(z < 2.0) < 0.99
+    # Planted: half of these errors hold too few, and those of independent lattices nearly all.
+    assert np.mean(z < 1.0) < 0.93
+    assert np.mean(z < 2.0 * 8**0.25) > 0.99
+
+    def beyond(wrong: float = 0.0) -> float:
+        """Return the fraction of shots beyond twice the tolerance; `wrong`: a planted relative error."""
+        significant = expected > 0.01 * peak
+        relative = np.where(significant, difference / np.where(significant, expected, 1.0) + wrong, 0.0)
+        error = np.sqrt((relative**2).sum(axis=(1, 2)) / significant.sum(axis=(1, 2)))
+        return float(np.mean(error > 2.0 * rtol))
+
+    assert beyond() < 0.02
+    assert beyond(wrong=2.0 * rtol) > 0.2
