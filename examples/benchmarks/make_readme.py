@@ -557,7 +557,7 @@ def devices(record: dict) -> str:
 
 
 def scene_retrieval(record: dict) -> str:
-    rows = record["footprints"]
+    rows, narrow, terrain = record["footprints"], record["narrow"], record["terrain"]
     leaves = [
         [
             r["stand"],
@@ -591,6 +591,54 @@ def scene_retrieval(record: dict) -> str:
         "All priors explain the records to their noise. Leaf area beyond that of the Markov field, in "
         "crowns narrower than a footprint, is not in these records: it comes from what `clumped_leaves` is "
         "told of the crowns, and is no better than that.",
+        f"**Narrow shots.** The crowns from {narrow['shots']:,} shots 0.5 m wide, up to 10 degrees off "
+        f"nadir: leaf area {100 * narrow['leaf area error']:+.1f} %, correlation of the voxels "
+        f"{narrow['voxel correlation']:.3f}, and {narrow['correlation in 2 m']:.3f} of means over 2 m; "
+        f"{number(narrow['cpu seconds'])} CPU seconds, {number(narrow['peak GB'])} GB.",
+        f"**Terrain under leaves.** {terrain['shots']} footprints of 25 m, 2.5 m apart, over hills under "
+        f"leaves of unknown density. The rms error of the ground's height is {terrain['rms alone']:.2f} m "
+        f"where each footprint is fitted alone, over a slope of its own, and {terrain['rms together']:.2f} m "
+        "where nodes of the terrain and voxels of leaves are fitted to all records together, from there on; "
+        f"{number(terrain['cpu seconds'])} CPU seconds.",
+    )
+
+
+def narrow_shots(record: dict) -> str:
+    flight = record["flight"]
+    stages = ("simulate", "returns", "files")
+    return page_of(
+        "Shots of a scanner 0.3 m wide, at first order, over the forest of the surveys above. A numba kernel "
+        "marches as many rays for every shot as jaxlidar begins with, and deposits them in the same bins. It "
+        "leaves out more rays where they are needed, errors, the pulse, samples and the energy budget.",
+        table(
+            (
+                "shots",
+                "tolerance",
+                "error, median",
+                "µs a shot",
+                "numba: rays a shot",
+                "µs a shot",
+                "µs a ray",
+            ),
+            [
+                (
+                    f"{r['shots']:,}",
+                    f"{number(100 * r['tolerance'])} %",
+                    f"{number(100 * r['error, median'])} %",
+                    number(r["us per shot, simulate_many"]),
+                    str(r["first rays"]),
+                    number(r["us per shot, numba"]),
+                    number(r["us per ray, numba"]),
+                )
+                for r in record["by tolerance"]
+            ],
+        ),
+        f"{flight['shots']:,} shots, line by line, to {number(100 * flight['tolerance'])} %, with returns of "
+        f"the peak detector written as LAZ: {number(flight['seconds'])} s, "
+        f"{number(sum(flight[f'us per shot, {s}'] for s in stages))} µs a shot ("
+        + ", ".join(f"{s} {number(flight[f'us per shot, {s}'])}" for s in stages)
+        + f"), {number(flight['points'], 4)} points of {number(flight['bytes per point'])} bytes, at most "
+        f"{number(flight['peak GB'])} GB.",
     )
 
 
@@ -599,6 +647,7 @@ SECTIONS: dict[str, tuple[str, Callable[[dict], str]]] = {
     "simulation_cost": ("Cost of `simulate`", simulation),
     "everyday_changes": ("Cost of changing a scene", changes),
     "surveys": ("Cost of thousands of footprints", surveys),
+    "narrow_shots": ("Cost of narrow shots", narrow_shots),
     "peers": ("Other codes", peers),
     "effects_cost": ("Time saved by plans", effects),
     "scaling": ("Scaling of cost", scaling),

@@ -1,7 +1,7 @@
-"""One scene from many records: leaf area in voxels from overlapping wide footprints.
+"""One scene from many records: leaf area in voxels, from wide footprints and from narrow shots, and terrain.
 
-Run it as `python examples/benchmarks/scene_retrieval.py [--out figures] [--footprints 225] [--voxel 1]`;
-`--voxel` is the width of voxels in m, which are 1 m high.
+Run it as `python examples/benchmarks/scene_retrieval.py [--out figures] [--footprints 225] [--shots 20000]
+[--track 200] [--voxel 1]`; `--voxel` is the width of voxels in m, which are 1 m high.
 
 Footprints 25 m across over a stand of 60 m x 60 m x 25 m in the open, simulated at first order, with normal
 noise of 2 % of the largest sample. Leaves vary over tens of metres ("even"), or are in crowns of 3 to 6 m
@@ -13,6 +13,7 @@ import resource
 import warnings
 from pathlib import Path
 
+import equinox as eqx
 import jax
 import numpy as np
 from _common import machine, new_figure, options, print_table, save_figure, write_json
@@ -21,6 +22,8 @@ import inversion
 import jaxlidar as jl
 
 SIDE, LAYERS, NOISE = 60, 25, 0.02
+# Width of the strip of terrain along a track of footprints, m.
+WIDTH = 60.0
 # Leaf area density within crowns, m2/m3, and the crowns' mean diameter and height, m.
 CROWN_DENSITY, CROWN_SIZE = 0.6, (4.5, 12.0)
 LEAF, SOIL = jl.LeafOptics(0.45, 0.4), 0.3
@@ -152,36 +155,187 @@ def wide_footprints(shots: int, edge: float) -> list[dict]:
     return rows
 
 
-def draw(rows: list[dict], out: Path) -> None:
-    """Draw the profiles of the stands."""
-    figure, axes = new_figure(2, size=(9, 4))
-    height = np.arange(LAYERS) + 0.5
-    for panel, name, title in zip(axes, ("even", "crowns"), ("even leaves", "leaves in crowns")):
-        of_stand = [r for r in rows if r["stand"] == name]
-        panel.plot(of_stand[0]["true profile"], height, color="0.3", lw=2, label="truth")
-        for row, style in zip(of_stand, ("--", ":", "-.")):
+def narrow_shots(shots: int, edge: float) -> dict:
+    """Retrieve crowns from shots of a scanner, 0.5 m wide and up to 10 degrees off nadir."""
+    lidar = jl.Lidar(wavelength=1064.0, altitude=1000.0, divergence=0.5, pulse=jl.GaussianPulse(4.0))
+    random = np.random.default_rng(3)
+    position = random.uniform(1.0, SIDE - 1.0, (shots, 2))
+    zenith, azimuth = random.uniform(0.0, 10.0, shots), random.uniform(0.0, 360.0, shots)
+    survey, lad = jl.Survey(lidar, position, zenith, azimuth), crowns(edge)
+    scene = stand(lad)
+    fit, row = retrieve(observe(survey, scene), survey, scene, [leaf_unknown(lad, 0.3)], n_rays=16)
+    retrieved = 2.0 * np.asarray(fit.scene.canopy.voxels.leaf, float)
+
+    def in_blocks(a: np.ndarray) -> np.ndarray:
+        """Return means over blocks of 2 m, without the layer that is left over."""
+        across, height = round(2.0 / edge), 2
+        a = a[:, :, : a.shape[2] // height * height]
+        nx, ny, nz = (n // size for n, size in zip(a.shape, (across, across, height)))
+        return a.reshape(nx, across, ny, across, nz, height).mean(axis=(1, 3, 5))
+
+    blocks, true_blocks = in_blocks(retrieved).ravel(), in_blocks(lad).ravel()
+    by_voxel = np.corrcoef(retrieved.ravel(), lad.ravel())[0, 1]
+    by_block = np.corrcoef(blocks, true_blocks)[0, 1]
+    correlations = {"voxel correlation": float(by_voxel), "correlation in 2 m": float(by_block)}
+    middle = len(lad) // 2
+    sections = {"true section": lad[:, middle].tolist(), "section": retrieved[:, middle].round(3).tolist()}
+    return {"stand": "crowns", "edge": edge, **row, **leaf_errors(fit, lad), **correlations, **sections}
+
+
+def hills(spacing: float, length: float) -> np.ndarray:
+    """Return heights of nodes on a strip of the given length, `WIDTH` wide, in m."""
+    x = spacing * np.arange(round(length / spacing) + 1)[:, None]
+    y = spacing * np.arange(round(WIDTH / spacing) + 1)[None, :]
+    return 5.0 + 2.5 * np.sin(x / 19.0) + 1.5 * np.cos(x / 31.0 + y / 23.0)
+
+
+def terrain_track(shots: int) -> dict:
+    """Retrieve terrain and leaves along a track of overlapping footprints, together and one by one.
+
+    Leaves and terrain are unknown; the ground under each footprint alone is a slope of unknown height.
+    """
+    spacing, step, margin = 5.0, 2.5, 30.0
+    length = 2.0 * margin + 10.0 * np.ceil(step * (shots - 1) / 10.0)
+    lidar = jl.Lidar(wavelength=1064.0, altitude=1000.0, divergence=25.0, pulse=jl.GaussianPulse(6.0))
+    track = np.stack([margin + step * np.arange(shots), np.full(shots, 0.5 * WIDTH)], axis=1)
+    survey, heights = jl.Survey(lidar, track), hills(spacing, length)
+    random, n_layers = np.random.default_rng(4), 36
+    z, shape = np.arange(n_layers) + 0.5, (round(length / 10.0), round(WIDTH / 10.0))
+    top = random.uniform(14.0, 22.0, shape)[..., None] + hills(10.0, length)[:-1, :-1, None]
+    lad = 0.35 * random.uniform(0.6, 1.4, shape)[..., None] * np.exp(-0.5 * ((z - top + 6.0) / 3.5) ** 2)
+
+    def scene_of(leaf: np.ndarray, nodes: np.ndarray) -> jl.Scene:
+        voxels = jl.VoxelMap.from_lad(leaf, voxel_size=(10.0, 10.0, 1.0))
+        return jl.Scene(
+            canopy=jl.Canopy(voxels, leaf=LEAF), ground=jl.Terrain(nodes, spacing, reflectance=SOIL)
+        )
+
+    true_scene = scene_of(lad, heights)
+    records = observe(survey, true_scene)
+    # Footprint by footprint first: what each finds is where the fit of all together starts.
+    found, failed = one_by_one(survey, records, n_layers)
+    nearest = np.abs(track[:, 0, None] - spacing * np.arange(len(heights))).argmin(axis=0)
+    nearest_of_column = np.abs(track[:, 0, None] - 10.0 * (np.arange(shape[0]) + 0.5)).argmin(axis=0)
+    # Relief of a centimetre, as heights in a plane are traced as one.
+    start_heights = found["height"][nearest][:, None] + 0.01 * random.normal(size=heights.shape)
+    start_leaf = np.repeat(found["leaf"][nearest_of_column][:, None], shape[1], axis=1)
+    start = scene_of(start_leaf, np.clip(start_heights, 0.0, 12.0))
+    leaf = inversion.Unknown(
+        "canopy.voxels.leaf", bounds=(0.0, 2.0), name="leaf", prior=inversion.MarkovField(0.1)
+    )
+    nodes = inversion.Unknown(
+        "ground.heights", bounds=(0.0, 12.0), name="heights", prior=inversion.MarkovField(1.0)
+    )
+    fit, row = retrieve(records, survey, start, [leaf, nodes], n_rays=128)
+    inner = slice(shots // 20, -shots // 20)
+    true_height = np.asarray(true_scene.ground.height_at(*track.T))
+    together = np.asarray(fit.scene.ground.height_at(*track.T)) - true_height
+    alone = found["height"] - true_height
+
+    def rms(error: np.ndarray) -> float:
+        return float(np.sqrt(np.mean(error[inner] ** 2)))
+
+    return {
+        **row,
+        "rms together": rms(together),
+        "rms alone": rms(alone),
+        "failed alone": failed,
+        "x": track[:, 0].tolist(),
+        "true height": true_height.tolist(),
+        "error together": together.tolist(),
+        "error alone": alone.tolist(),
+    }
+
+
+def one_by_one(survey: jl.Survey, records: dict, n_layers: int) -> tuple[dict, int]:
+    """Fit each footprint alone: height and slope of the ground, and leaves by layer; count what failed."""
+    layers = jl.VoxelMap.from_lad(
+        np.full((1, 1, n_layers), 0.05), voxel_size=(2000.0, 2000.0, 1.0), origin=(-1000.0, -1000.0, 0.0)
+    )
+    ground = jl.Ground(height=5.0, slope=5.0, reflectance=SOIL)
+    scene = jl.Scene(canopy=jl.Canopy(layers, leaf=LEAF), ground=ground)
+
+    def layers_set(scene: jl.Scene, lad: jax.Array) -> jl.Scene:
+        return eqx.tree_at(lambda s: s.canopy.voxels.leaf, scene, 0.5 * lad[None, None])
+
+    unknowns = [
+        inversion.Unknown(
+            apply=layers_set,
+            bounds=(0.0, 2.0),
+            start=np.full(n_layers, 0.1),
+            name="leaf",
+            prior=inversion.Smooth(3.0, strength=0.1),
+        ),
+        inversion.Unknown("ground.height", bounds=(0.0, 12.0), name="height"),
+        inversion.Unknown("ground.slope", bounds=(0.0, 20.0), name="slope"),
+    ]
+    fits = inversion.retrieve_many(
+        records["observed"],
+        survey.lidar,
+        scene,
+        unknowns,
+        noise=records["noise"],
+        time=records["time"],
+        key=jax.random.key(2),
+        max_orders=1,
+        starts=3,
+    )
+    return {name: np.asarray(a) for name, a in fits.values.items()}, int(np.sum(~np.asarray(fits.converged)))
+
+
+def draw(record: dict, out: Path) -> None:
+    """Draw the profiles of the stands, a section through the crowns, and the errors of the terrain."""
+    figure, axes = new_figure(3, size=(12, 7), rows=2)
+    height, narrow, terrain = np.arange(LAYERS) + 0.5, record["narrow"], record["terrain"]
+    titles = {"even": "wide footprints, even leaves", "crowns": "wide footprints, leaves in crowns"}
+    panels = [(title, [r for r in record["footprints"] if r["stand"] == s]) for s, title in titles.items()]
+    panels.append(("narrow shots, leaves in crowns", [{"prior": "Markov field", **narrow}]))
+    for panel, (title, rows) in zip(axes[0], panels):
+        panel.plot(rows[0]["true profile"], height, color="0.3", lw=2, label="truth")
+        for row, style in zip(rows, ("--", ":", "-.")):
             label = f"{row['prior']}, leaf area {100 * row['leaf area error']:+.0f} %"
             panel.plot(row["profile"], height, style, lw=2, label=label)
-        panel.set(
-            xlabel="leaf area density, m2/m3",
-            ylabel="height, m",
-            title=title,
-        )
+        panel.set(xlabel="leaf area density, m2/m3", ylabel="height, m", title=title)
         panel.set(xlim=(0.0, None), ylim=(0.0, LAYERS))
         panel.legend(fontsize=8)
+    extent = (0.0, SIDE, 0.0, LAYERS)
+    for panel, name in zip(axes[1], ("true section", "section")):
+        image = panel.imshow(np.transpose(narrow[name]), origin="lower", extent=extent, vmin=0, vmax=0.8)
+        title = "truth" if name == "true section" else f"retrieved from {narrow['shots']:,} narrow shots"
+        panel.set(xlabel="east, m", ylabel="height, m", title=title)
+        panel.set_aspect("auto")
+    figure.colorbar(image, ax=axes[1, :2], label="leaf area density, m2/m3", shrink=0.8)
+    panel = axes[1, 2]
+    for name in ("alone", "together"):
+        label = f"{name}, rms {terrain[f'rms {name}']:.2f} m"
+        panel.plot(terrain["x"], terrain[f"error {name}"], lw=1, label=label)
+    panel.set(
+        xlabel="along the track, m", ylabel="error of the ground's height, m", title="terrain under leaves"
+    )
+    panel.legend(fontsize=8)
     save_figure(figure, out / "scene_retrieval.png")
 
 
 def main() -> None:
-    arguments = options("One scene from many records.", footprints=225, voxel=1)
+    arguments = options("One scene from many records.", footprints=225, shots=20_000, track=200, voxel=1)
     warnings.simplefilter("ignore", jl.OffMapWarning)
-    rows = wide_footprints(arguments.footprints, float(arguments.voxel))
-    write_json(arguments.out / "scene_retrieval.json", {"machine": machine(), "footprints": rows})
-    draw(rows, arguments.out)
+    # Voxels of leaves reach down to the lowest terrain; below the ground they are dark.
+    warnings.simplefilter("ignore", jl.MisplacedCanopyWarning)
+    edge = float(arguments.voxel)
+    record = {
+        "footprints": wide_footprints(arguments.footprints, edge),
+        "narrow": narrow_shots(arguments.shots, edge),
+        "terrain": terrain_track(arguments.track),
+    }
+    write_json(arguments.out / "scene_retrieval.json", {"machine": machine(), **record})
+    draw(record, arguments.out)
     columns = ("leaf area error", "profile correlation", "misfit", "cpu seconds")
+    rows = [*record["footprints"], {"prior": "narrow shots", **record["narrow"]}]
     print_table(
         ("stand, prior", *columns), [(f"{r['stand']}, {r['prior']}", *(r[c] for c in columns)) for r in rows]
     )
+    terrain = record["terrain"]
+    print(f"terrain: rms {terrain['rms alone']:.3f} m alone, {terrain['rms together']:.3f} m together")
 
 
 if __name__ == "__main__":
