@@ -279,6 +279,7 @@ def one_by_one(survey: jl.Survey, records: dict, n_layers: int) -> tuple[dict, i
         key=jax.random.key(2),
         max_orders=1,
         starts=3,
+        n_rays=128,
     )
     return {name: np.asarray(a) for name, a in fits.values.items()}, int(np.sum(~np.asarray(fits.converged)))
 
