@@ -19,6 +19,10 @@ Counts become amplitudes by the file's tables. Saturated samples have no weight.
 is estimated from the narrowest single echoes of the file. No true ground is known: rows give the fitted
 ground beside the last echo of the decomposition into copies of the pulse. The two differ if a target returns
 light within a pulse's length of the ground, or if the ground is faint.
+
+The standard error of the canopy's top contains that upper layers may be empty, and that plants where the
+record begins may be in no layer. Plants that no sample shows are not in it: of a canopy that thins out
+upwards, the top is low.
 """
 
 import argparse
@@ -64,6 +68,8 @@ STEEPEST = 30.0
 # A fitted ground further than this from the last echo is doubtful, m; so is a single echo broadened by more
 # than this fraction of its pulse's standard deviation.
 DOUBTFUL_DISTANCE, DOUBTFUL_BROADENING = 1.0, 0.5
+# The highest return exceeds this many standard deviations of the noise: GEDI's threshold of the front.
+FRONT_THRESHOLD = 3.0
 # Samples of a pulse before and after its time zero, in verdicts on records.
 LAGS = 80
 # Bounds of the broadening of a single echo, ns, and of offsets and gain, over the record's peak.
@@ -144,11 +150,15 @@ class FitWindow(NamedTuple):
 
 
 class FittedBatch(NamedTuple):
-    """Retrievals of one kind of scene, with the window and the recorder of every shot."""
+    """Retrievals of one kind of scene, with the window and the recorder of every shot.
+
+    `highest_return`: (shots,) m over the reference of the window.
+    """
 
     fits: inversion.Retrievals
     windows: list[FitWindow]
     recorders: list[Recorder]
+    highest_return: np.ndarray
 
 
 def window_of(record: AirborneRecord, last_echo: float, time: np.ndarray) -> FitWindow:
@@ -162,6 +172,24 @@ def window_of(record: AirborneRecord, last_echo: float, time: np.ndarray) -> Fit
     reference = float(record.elevation[middle])
     metres_per_ns = record.shot.direction[2] * record.shot.metres[2]
     return FitWindow(signal, noise, reference + metres_per_ns * time, reference)
+
+
+def highest_returns(
+    records: Sequence[AirborneRecord], windows: Sequence[FitWindow], impulse: np.ndarray | None
+) -> np.ndarray:
+    """Heights of the highest returns over the references of their windows, m, (shots,); NaN without one.
+
+    A return begins before its target by half of a pulse's length, which is taken off.
+    """
+    ends = inversion.signal_ends(
+        np.stack([w.elevation - w.reference for w in windows]),
+        np.stack([w.signal for w in windows]),
+        noise=np.array([record.quiet for record in records]),
+        pulse=np.stack([record.pulse(LAGS, impulse) for record in records]),
+        threshold=FRONT_THRESHOLD,
+    )
+    half_pulse = 2.0 * METRES_PER_NS * np.array([float(record.lidar.pulse.std) for record in records])
+    return np.asarray(ends.top, float) - half_pulse
 
 
 def fit(
@@ -196,9 +224,10 @@ def fit(
         )
         for record in records
     ]
-    # The canopy starts a metre above its first echo.
     lowest, highest = instrument.clearance + 1.0, instrument.tallest - 2.0
-    height = [np.clip(e[0] - e[-1] + 1.0, lowest, highest) for e in echoes]
+    # From the first echo, where plants are dense, fits end in minima several metres below thin tops.
+    top = highest_returns(records, windows, impulse)
+    height = np.clip(np.fmax(top, [e[0] - e[-1] for e in echoes]), lowest, highest)
     fits = inversion.retrieve_many(
         np.stack([w.signal for w in windows])[:, None],
         lidars,
@@ -216,7 +245,7 @@ def fit(
             n_rays=64 if is_wide else 16,
             footprint="fixed",
         ),
-        start={} if kind.canopy is None else {"canopy height": np.array(height)},
+        start={} if kind.canopy is None else {"canopy height": height},
         max_steps=150,
         scale=SCALE,
         recorder=recorders,
@@ -224,7 +253,7 @@ def fit(
         path=path,
         progress=progress,
     )
-    return FittedBatch(fits, windows, recorders)
+    return FittedBatch(fits, windows, recorders, top)
 
 
 def identity_of(shot, echoes=()):
@@ -290,8 +319,12 @@ def row_of(
     if kind.canopy is None:
         row |= quality_of(batch.fits, i, verdict)
     else:
-        row["canopy_top"] = ground + float(values["canopy height"])
-        row["canopy_top_stderr"] = float(np.hypot(stderr["canopy height"], ground_stderr))
+        canopy = kind.canopy.estimates(batch.fits, i)
+        row["canopy_top"] = window.reference + canopy.top
+        # Ten layers of equal thickness may leave thin plants at the top out: two standard errors reach up to
+        # where the record begins.
+        above = np.fmax(batch.highest_return[i] - canopy.top, 0.0)
+        row["canopy_top_stderr"] = float(np.hypot(canopy.top_stderr, 0.5 * above))
         row |= columns_of_canopy(kind.canopy, batch.fits, i, verdict)
         top = {"canopy top": row["canopy_top"]}
     fitted = recorder.recorded(batch.fits.fitted[i, 0], values, step=record.shot.sampling_interval)

@@ -15,11 +15,8 @@ proportion to the signal. Samples in the receiver's tail, which the transmitted 
 fitted.
 
 **Errors** are the robust standard errors of the fit (`inversion.fit.uncertainty`), with nothing added but to
-that of the top. They contain neither the fixed reflectances nor what relief within the footprint does to the
-ground's echo. A record hardly tells an all but empty layer from none, and errors that are linear about the
-minimum do not contain that such layers could go. So two standard errors of the top reach from it to the
-underside of the uppermost layer that the record shows: whose density lies two of its standard errors above
-zero.
+that of the top, as `LayeredCanopy.estimates` does. They contain neither the fixed reflectances nor what
+relief within the footprint does to the ground's echo.
 """
 
 import dataclasses
@@ -35,7 +32,6 @@ import jaxlidar as jl
 from inversion.fit.quality import Verdict, judge_fits
 from inversion.fit.result import Retrievals
 from inversion.fit.retrieval_many import RetrievalProgress, retrieve_many
-from inversion.fit.uncertainty import correlation_of
 from inversion.fit.unknowns import Unknown
 from inversion.metrics.gedi import RECEIVER_SMOOTHING, judge_shot
 from inversion.scene.layered_canopy import LAYERS, LayeredCanopy
@@ -60,8 +56,6 @@ _SIGNAL_SIGMAS, _TOP_ECHO, _START_HEIGHTS = 3.0, 2.0, (2.0, 38.0)
 _AMBIGUOUS_GROUND, _CHI2_FACTOR = 0.5, 2.0
 # A fitted ground further than this from the mode that it started from is doubtful, m.
 _DOUBTFUL_DISTANCE = 0.5
-# A layer whose density is smaller than this many of its standard errors may be empty.
-_SHOWN_SIGMAS = 2.0
 # Bounds of the gain: fractions of the signal over an apparent reflectance.
 _GAINS = (0.0, 20.0)
 
@@ -301,34 +295,22 @@ def _empty_fits(shots: int, retrievals: Retrievals | None) -> GediFits:
 
 
 def _store(fits: GediFits, i: int, prepared: PreparedShot, retrievals: Retrievals, number: int) -> None:
-    """Write the estimates of shot `i`, those of a fit by its number in `retrievals`, into `fits`.
-
-    Errors of sums of unknowns are those of their joint covariance. With d the layers' densities and h the
-    height of the canopy above its clearance, the plant area index is h mean(d), with the derivatives h d_k /
-    (number of layers) by log d_k, and mean(d) by h.
-    """
+    """Write the estimates of shot `i`, those of a fit by its number in `retrievals`, into `fits`."""
     values = {name: np.asarray(value[number], float) for name, value in retrievals.values.items()}
     stderr = {name: np.asarray(error[number], float) for name, error in retrievals.robust_stderr.items()}
-    density = np.exp(values["log density"])
-    depth = values["canopy height"] - CANOPY.clearance
-    by_top = {"ground": 1.0, "canopy height": 1.0}
-    by_area = {"log density": depth * density / LAYERS, "canopy height": np.mean(density)}
-    covariance = _robust_covariance(retrievals, number)
+    canopy = CANOPY.estimates(retrievals, number)
     estimates = {
         "ground": prepared.reference + values["ground"],
         "ground_stderr": stderr["ground"],
-        "canopy_top": prepared.reference + values["ground"] + values["canopy height"],
-        "canopy_top_stderr": np.hypot(
-            _propagated(by_top, covariance, values),
-            _top_error(density, density * stderr["log density"], float(depth) / LAYERS),
-        ),
+        "canopy_top": prepared.reference + canopy.top,
+        "canopy_top_stderr": canopy.top_stderr,
         "slope": values["slope"],
         "slope_stderr": stderr["slope"],
-        "pai": depth * np.mean(density),
-        "pai_stderr": _propagated(by_area, covariance, values),
+        "pai": canopy.pai,
+        "pai_stderr": canopy.pai_stderr,
         "reduced_chi2": retrievals.reduced_chi2[number],
-        "plant_area_density": density,
-        "plant_area_density_stderr": density * stderr["log density"],
+        "plant_area_density": canopy.density,
+        "plant_area_density_stderr": canopy.density_stderr,
     }
     for name, value in estimates.items():
         fits.estimates[name][i] = value
@@ -336,37 +318,3 @@ def _store(fits: GediFits, i: int, prepared: PreparedShot, retrievals: Retrieval
     fits.elevation[i] = prepared.elevation
     fits.signal[i] = prepared.signal * prepared.total
     fits.fitted[i] = values["scale"] * retrievals.fitted[number, 0] * prepared.total
-
-
-def _top_error(
-    density: Float[np.ndarray, " layers"], stderr: Float[np.ndarray, " layers"], thickness: float
-) -> float:
-    """Return half of the distance in m from the top to the underside of the uppermost layer that is shown.
-
-    **Arguments:** `density`, `stderr`: of the layers from below. `thickness`: of a layer in m. Without any
-    layer that is shown, the distance is that to the underside of all.
-    """
-    (shown,) = np.nonzero(density >= _SHOWN_SIGMAS * stderr)
-    number_of_layers = density.size - (shown[-1] if shown.size else 0)
-    return 0.5 * thickness * number_of_layers
-
-
-def _robust_covariance(retrievals: Retrievals, number: int) -> Float[np.ndarray, "n n"]:
-    """Return a covariance with the robust standard errors and the correlations of a fit."""
-    stderr = np.concatenate([np.ravel(error[number]) for error in retrievals.robust_stderr.values()])
-    return correlation_of(retrievals.covariance[number]) * np.outer(stderr, stderr)
-
-
-def _propagated(
-    derivatives: dict[str, Any], covariance: Float[np.ndarray, "n n"], values: dict[str, np.ndarray]
-) -> float:
-    """Return the standard error of a quantity, by its derivatives by some of the unknowns."""
-    gradient = np.concatenate(
-        [
-            np.broadcast_to(derivatives.get(name, 0.0), np.shape(value)).ravel()
-            for name, value in values.items()
-        ]
-    )
-    # Unknowns that do not act are left out: their errors may be infinite.
-    acts = gradient != 0
-    return float(np.sqrt(gradient[acts] @ covariance[np.ix_(acts, acts)] @ gradient[acts]))

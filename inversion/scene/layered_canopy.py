@@ -2,9 +2,14 @@
 
 The canopy is horizontally uniform: `LAYERS` layers of equal thickness from a clearance above the ground to
 the top. One waveform tells no more of a scene than heights and a profile.
+
+**Error of the top.** A record hardly tells an all but empty layer from none, and errors that are linear about
+the minimum do not contain that such layers could go. So two standard errors of the top reach from it to the
+underside of the uppermost layer that the record shows: whose density lies two of its standard errors above
+zero.
 """
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -12,6 +17,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 import jaxlidar as jl
+from inversion.fit.uncertainty import correlation_of
 
 LAYERS = 10
 # Reflectance and transmittance of leaves, and reflectance of the ground.
@@ -23,6 +29,24 @@ REFLECTANCE_RATIO = 2.0 / 3.0 * _LEAF[0] / GROUND
 _PROJECTION = 0.5
 # Edge of the periodic scene in m: wider than a footprint.
 _WIDTH = 50.0
+# A layer whose density is smaller than this many of its standard errors may be empty.
+_SHOWN_SIGMAS = 2.0
+
+
+class CanopyEstimates(NamedTuple):
+    """Estimates of a fit with their robust standard errors.
+
+    - `top`: m over the height zero of the fit.
+    - `pai`: plant area index of the layers.
+    - `density`: (layers,) plant area density of the layers in m2/m3, from below.
+    """
+
+    top: float
+    top_stderr: float
+    pai: float
+    pai_stderr: float
+    density: Float[np.ndarray, " layers"]
+    density_stderr: Float[np.ndarray, " layers"]
 
 
 class LayeredCanopy:
@@ -61,3 +85,62 @@ class LayeredCanopy:
             canopy=jl.Canopy(voxels, leaf=jl.LeafOptics(*_LEAF), sides="periodic", hotspot=True),
             ground=jl.Ground(height=ground, reflectance=GROUND, slope=slope),
         )
+
+    def estimates(self, retrievals: Any, number: int) -> CanopyEstimates:
+        """Return what a fit of `inversion.retrieve_many`, by its number, says of the canopy.
+
+        The unknowns are named "ground", "canopy height" and "log density". Errors of sums of unknowns are
+        those of their joint covariance. With d the layers' densities and h the height of the canopy above its
+        clearance, the plant area index is h mean(d), with the derivatives h d_k / (number of layers) by log
+        d_k, and mean(d) by h. To the error of the top is added that its uppermost layers may be empty.
+        """
+        values = {name: np.asarray(value[number], float) for name, value in retrievals.values.items()}
+        density = np.exp(values["log density"])
+        density_stderr = density * np.asarray(retrievals.robust_stderr["log density"][number], float)
+        depth = float(values["canopy height"]) - self.clearance
+        by_top = {"ground": 1.0, "canopy height": 1.0}
+        by_area = {"log density": depth * density / LAYERS, "canopy height": np.mean(density)}
+        covariance = _robust_covariance(retrievals, number)
+        linear_error = _propagated(by_top, covariance, values)
+        return CanopyEstimates(
+            top=float(values["ground"] + values["canopy height"]),
+            top_stderr=float(np.hypot(linear_error, _top_error(density, density_stderr, depth / LAYERS))),
+            pai=float(depth * np.mean(density)),
+            pai_stderr=_propagated(by_area, covariance, values),
+            density=density,
+            density_stderr=density_stderr,
+        )
+
+
+def _top_error(
+    density: Float[np.ndarray, " layers"], stderr: Float[np.ndarray, " layers"], thickness: float
+) -> float:
+    """Return half of the distance in m from the top to the underside of the uppermost layer that is shown.
+
+    **Arguments:** `density`, `stderr`: of the layers from below. `thickness`: of a layer in m. Without any
+    layer that is shown, the distance is that to the underside of all.
+    """
+    (shown,) = np.nonzero(density >= _SHOWN_SIGMAS * stderr)
+    number_of_layers = density.size - (shown[-1] if shown.size else 0)
+    return 0.5 * thickness * number_of_layers
+
+
+def _robust_covariance(retrievals: Any, number: int) -> Float[np.ndarray, "n n"]:
+    """Return a covariance with the robust standard errors and the correlations of a fit."""
+    stderr = np.concatenate([np.ravel(error[number]) for error in retrievals.robust_stderr.values()])
+    return correlation_of(retrievals.covariance[number]) * np.outer(stderr, stderr)
+
+
+def _propagated(
+    derivatives: dict[str, Any], covariance: Float[np.ndarray, "n n"], values: dict[str, np.ndarray]
+) -> float:
+    """Return the standard error of a quantity, by its derivatives by some of the unknowns."""
+    gradient = np.concatenate(
+        [
+            np.broadcast_to(derivatives.get(name, 0.0), np.shape(value)).ravel()
+            for name, value in values.items()
+        ]
+    )
+    # Unknowns that do not act are left out: their errors may be infinite.
+    acts = gradient != 0
+    return float(np.sqrt(gradient[acts] @ covariance[np.ix_(acts, acts)] @ gradient[acts]))

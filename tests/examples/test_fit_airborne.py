@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 import inversion
+from inversion.scene import layered_canopy
 from jaxlidar.io import AirborneShot, Segment, write_las_waveforms
 from tests.io import test_neon, test_pulsewaves
 
@@ -161,6 +162,7 @@ def test_echoes_decide_which_scene_is_fitted(example, tmp_path, monkeypatch, cap
         fits = argparse.Namespace(
             values=values,
             robust_stderr={name: np.full_like(v, 0.1) for name, v in values.items()},
+            covariance=[0.01 * np.eye(sum(v[0].size for v in values.values()))] * n,
             prior_share={},
             reduced_chi2=np.ones(n),
             steps=np.ones(n, int),
@@ -169,7 +171,7 @@ def test_echoes_decide_which_scene_is_fitted(example, tmp_path, monkeypatch, cap
         )
         windows = [module.window_of(r, e[-1], time) for r, e in zip(records, echoes)]
         recorder = inversion.Recorder(width=(0.1, 5.0))
-        return module.FittedBatch(fits, windows, [recorder] * n)
+        return module.FittedBatch(fits, windows, [recorder] * n, np.full(n, 4.5))
 
     monkeypatch.setattr(module, "fit", fit)
     good = inversion.Verdict("good", ())
@@ -211,6 +213,57 @@ def test_planted_ground_is_found(example, tmp_path):
     assert all(row["ground_stderr"] < 0.02 for row in rows)
     assert rows[5]["broadening"] == pytest.approx(2.0, abs=4 * rows[5]["broadening_stderr"])
     assert all(row["reasons"].startswith("broader") == (i == 5) for i, row in enumerate(rows))
+
+
+def canopy_echo(random, size=500):
+    """Counts of a canopy over ground that is thin in its upper part, and the height of its top in m."""
+    top, cover = random.uniform(6.0, 24.0), random.uniform(0.2, 0.8)
+    base, step = random.uniform(1.0, 0.4 * top), -HALF_PATH[2] / 8
+    level = (60.0 - step * np.arange(8 * size) - base) / (top - base)
+    target = np.where((level > 0.0) & (level < 1.0), np.where(level > 0.6, 0.25, 1.0), 0.0)
+    target *= cover / target.sum()
+    target[round(60.0 / step)] += 1.0 - cover
+    sigma = 8 * FWHM / 2.3548
+    pulse = np.exp(-0.5 * (np.arange(-6 * int(sigma), 6 * int(sigma) + 1) / sigma) ** 2)
+    record = np.convolve(target, pulse, mode="same")[::8]
+    noise = 0.7 * random.normal(size=size)
+    return np.round(20.0 + 180.0 * record / record.max() + noise).astype(np.uint16), top
+
+
+@pytest.mark.slow
+def test_errors_of_the_top_hold_and_those_of_the_fit_alone_do_not(example, tmp_path):
+    random = np.random.default_rng(3)
+    records, tops = zip(*(canopy_echo(random) for _ in range(16)))
+    arguments = [str(las_of(tmp_path, *records)), "--pulse-width", str(FWHM), "--out", str(tmp_path / "out")]
+    rows = example("fit_airborne").main(arguments)
+    top, stderr = (np.array([row[name] for row in rows]) for name in ("canopy_top", "canopy_top_stderr"))
+    error = top - (ANCHOR - 60.0 + np.array(tops))
+    assert np.mean(np.abs(error) <= 2.0 * stderr) >= 0.9
+    # Negative control: without what is added for layers that may be empty.
+    added = np.array(
+        [
+            layered_canopy._top_error(
+                row["density"],
+                row["density_stderr"],
+                (row["canopy_top"] - row["ground"] - row["clearance"]) / layered_canopy.LAYERS,
+            )
+            for row in rows
+        ]
+    )
+    own = np.sqrt(np.maximum(stderr**2 - added**2, 0.0))
+    assert np.mean(np.abs(error) <= 2.0 * own) < 0.7
+
+
+def test_the_highest_return_is_that_of_the_first_plants(example, tmp_path):
+    module, airborne = example("fit_airborne"), example("_airborne")
+    records = echo([(30, 10), (60, 60), (90, 100)]), echo([(60, 100)])
+    options = argparse.Namespace(**{**NO_OPTIONS, "pulse_width": FWHM})
+    flight = airborne.read_flight(las_of(tmp_path, *records), options)
+    shots = airborne.records_of(flight.shots[:], flight)
+    last = [shots[0].elevation[90], shots[1].elevation[60]]
+    windows = [module.window_of(r, e, np.arange(-80.0, 20.0)) for r, e in zip(shots, last)]
+    samples = module.highest_returns(shots, windows, None) / -HALF_PATH[2]
+    np.testing.assert_allclose(samples, [60.0, 0.0], atol=FWHM)
 
 
 CASES = {

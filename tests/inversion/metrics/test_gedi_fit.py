@@ -5,6 +5,7 @@ import pytest
 
 import inversion
 from inversion.metrics import gedi_fit
+from inversion.scene import layered_canopy
 from inversion.scene.layered_canopy import LAYERS
 from jaxlidar.io import read_gedi_l1b
 from tests.inversion.metrics.test_gedi_table import RECORD, STEP, shot
@@ -71,26 +72,6 @@ def test_pulses_of_any_length_become_those_of_one_length():
     np.testing.assert_allclose(pulse.time, np.arange(100.0) - 40.0)
     np.testing.assert_allclose(pulse.samples, np.r_[record.pulse_power, np.zeros(19)], rtol=1e-6)
     assert gedi_fit._padded_pulse(record, 81).samples.shape == (81,)
-
-
-def test_errors_of_sums_need_the_covariance():
-    values = {"a": np.array(1.0), "b": np.array([1.0, 2.0]), "c": np.array(3.0)}
-    covariance = np.diag([1.0, 4.0, 9.0, np.inf])
-    covariance[0, 1] = covariance[1, 0] = -1.0
-    stderr = gedi_fit._propagated({"a": 1.0, "b": np.array([1.0, 0.0])}, covariance, values)
-    assert stderr == pytest.approx(np.sqrt(1.0 + 4.0 - 2.0))
-
-
-def test_the_top_is_uncertain_by_the_layers_that_may_be_empty():
-    density, stderr = np.full(LAYERS, 0.1), np.full(LAYERS, 0.01)
-    # The underside of the uppermost layer, one below the top; then of the third from above.
-    assert gedi_fit._top_error(density, stderr, 2.0) == pytest.approx(1.0)
-    stderr[-2:] = 0.06
-    assert gedi_fit._top_error(density, stderr, 2.0) == pytest.approx(3.0)
-    # An empty layer between full ones tells nothing of the top.
-    stderr[3] = 1.0
-    assert gedi_fit._top_error(density, stderr, 2.0) == pytest.approx(3.0)
-    assert gedi_fit._top_error(density, np.full(LAYERS, 1.0), 2.0) == pytest.approx(0.5 * 2.0 * LAYERS)
 
 
 # -- columns -----------------------------------------------------------------------------------------------
@@ -217,7 +198,7 @@ def test_errors_of_the_top_hold_and_those_of_the_fit_alone_do_not():
     # Negative control: without what is added for layers that may be empty.
     thickness = (table["fit_canopy_top"] - table["fit_ground"] - gedi_fit.CANOPY.clearance) / LAYERS
     layers = (table["fit_plant_area_density"], table["fit_plant_area_density_stderr"], thickness)
-    added = np.array([gedi_fit._top_error(*row) for row in zip(*layers)])
+    added = np.array([layered_canopy._top_error(*row) for row in zip(*layers)])
     own = np.sqrt(np.maximum(stderr**2 - added**2, 0.0))
     assert np.mean(np.abs(error)[is_good] <= 2.0 * own[is_good]) < 0.7
 
