@@ -24,7 +24,7 @@ choice among several modes of one group ("algorithm 10") is not reproduced.
 """
 
 import os
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -164,7 +164,7 @@ def gedi_metrics(shots: Any, settings: GediSettings | None = None) -> GediMetric
     settings = gedi_settings(1) if settings is None else GediSettings(*settings)
     for name, value in settings._asdict().items():
         check_range(name, value, 0.0, low_open=True)
-    return metrics_of_records(pad_shots(shots), settings)
+    return metrics_of_records(pad_shots(shots), [settings])[0]
 
 
 class PaddedShots(NamedTuple):
@@ -216,24 +216,63 @@ def pad_shots(shots: list[Any], *, size: int | None = None, is_checked: bool = F
     return PaddedShots(top, step, batches)
 
 
-def metrics_of_records(padded: PaddedShots, settings: GediSettings) -> GediMetrics:
-    """Compute the metrics of padded shots: `gedi_metrics` for records that are used with several settings."""
-    kernels = [_smoothing_kernel(settings.smoothing), _smoothing_kernel(settings.mode_smoothing)]
-    # Of one size for all published settings, so that they share a program.
+def metrics_of_records(padded: PaddedShots, settings: Sequence[GediSettings]) -> list[GediMetrics]:
+    """Compute the metrics of padded shots with each of several settings: see `gedi_metrics`.
+
+    Records are smoothed once for each width that the settings have.
+    """
+    # Two at least, so that all published settings share a program; of one size for the same reason.
+    widths = list(dict.fromkeys(width for s in settings for width in (s.smoothing, s.mode_smoothing)))
+    kernels = [_smoothing_kernel(width) for width in (widths * 2 if len(widths) == 1 else widths)]
     half_lags = max(_HALF_LAGS, *(kernel.size // 2 for kernel in kernels))
-    kernels = np.stack([np.pad(kernel, half_lags - kernel.size // 2) for kernel in kernels])
-    kernels = as_array(kernels)
-    thresholds = as_array((settings.front_threshold, settings.back_threshold))
-    top, step = padded.top, padded.step
-    features = {name: np.zeros(len(top)) for name in _RecordFeatures._fields if name != "rh"}
-    rh_position = np.zeros((len(top), _RH_FRACTIONS.size))
+    kernels = as_array(np.stack([np.pad(kernel, half_lags - kernel.size // 2) for kernel in kernels]))
+    chosen = np.array([[widths.index(s.smoothing), widths.index(s.mode_smoothing)] for s in settings])
+    thresholds = as_array([[s.front_threshold, s.back_threshold] for s in settings])
+    shape = (len(settings), len(padded.top))
+    features = {name: np.zeros(shape) for name in _RecordFeatures._fields if name != "energy_below"}
+    rh_position = np.zeros((*shape, _RH_FRACTIONS.size))
     for chunk, records, count, noise in padded.batches:
         computed = _record_features(
-            as_array(records), jnp.asarray(count), as_array(noise), kernels, thresholds
+            as_array(records), jnp.asarray(count), as_array(noise), kernels, jnp.asarray(chosen), thresholds
         )
         for name, values in features.items():
-            values[chunk] = np.asarray(getattr(computed, name))[: chunk.size]
-        rh_position[chunk] = np.asarray(computed.rh)[: chunk.size]
+            values[:, chunk] = np.asarray(getattr(computed, name))[:, : chunk.size]
+        energy_below = np.asarray(computed.energy_below)[:, : chunk.size]
+        rh_position[:, chunk] = _rh_positions(
+            energy_below, features["first"][:, chunk], features["last"][:, chunk]
+        )
+    return [
+        _metrics(padded, {name: values[n] for name, values in features.items()}, rh_position[n])
+        for n in range(len(settings))
+    ]
+
+
+def _rh_positions(
+    energy_below: Float[np.ndarray, "settings shots positions"],
+    first: Float[np.ndarray, "settings shots"],
+    last: Float[np.ndarray, "settings shots"],
+) -> Float[np.ndarray, "settings shots 101"]:
+    """Return the positions below which 0, 1, ... 100 % of the energy lie.
+
+    On the host: a running maximum takes several times as long in a compiled program.
+    """
+    # Noise must not make the cumulated energy fall: the search needs it sorted.
+    fraction = np.maximum.accumulate(energy_below, axis=-1)
+    fraction /= np.maximum(energy_below[..., -1:], np.finfo(fraction.dtype).tiny)
+    levels = _RH_FRACTIONS.astype(fraction.dtype)
+    size = fraction.shape[-1]
+    n_below = [np.searchsorted(row, levels) for row in fraction.reshape(-1, size)]
+    position = np.minimum(size - np.reshape(n_below, (*first.shape, levels.size)), last[..., None])
+    # All energy lies below the beginning of the signal, whatever rounding makes of the last fraction.
+    position[..., -1] = first
+    return position
+
+
+def _metrics(
+    padded: PaddedShots, features: dict[str, np.ndarray], rh_position: Float[np.ndarray, "shots 101"]
+) -> GediMetrics:
+    """Return the metrics by the features of records: see `_RecordFeatures`."""
+    top, step = padded.top, padded.step
     # Positions count quarter bins downwards from the first sample.
     spacing = step / _SUBDIVISIONS
     has_signal = features["has_signal"] > 0
@@ -312,13 +351,13 @@ def _smoothing_kernel(width: float) -> np.ndarray:
 
 
 class _RecordFeatures(NamedTuple):
-    """Features of records, (shots, ...); positions in quarter bins from the first sample downwards.
+    """Features of records, (settings, shots, ...); positions in quarter bins from the first sample downwards.
 
     - `has_signal`: True if the record has a beginning and, below it, an end.
     - `n_modes`: number of modes.
     - `first`, `last`: positions of the signal's beginning and end.
     - `lowest_mode`: position of the lowest mode.
-    - `rh`: (shots, 101) positions below which 0, 1, ... 100 % of the energy lie.
+    - `energy_below`: (settings, shots, positions) energy of the signal up to positions that count from below.
     """
 
     has_signal: Array
@@ -326,7 +365,7 @@ class _RecordFeatures(NamedTuple):
     first: Array
     last: Array
     lowest_mode: Array
-    rh: Array
+    energy_below: Array
 
 
 @jax.jit
@@ -334,28 +373,33 @@ def _record_features(
     records: Float[Array, "shots bins"],
     n_samples: Int[Array, " shots"],
     noise: Float[Array, " shots"],
-    kernels: Float[Array, "2 lags"],
-    thresholds: Float[Array, "2"],
+    kernels: Float[Array, "kernels lags"],
+    chosen: Int[Array, "settings 2"],
+    thresholds: Float[Array, "settings 2"],
 ) -> _RecordFeatures:
-    """Features of several records; the steps are those of the module's docstring."""
+    """Features of several records; the steps are those of the module's docstring.
+
+    `chosen`: kernels of the settings by number, for the signal and for modes.
+    """
     size = records.shape[1] * _SUBDIVISIONS
     half = kernels.shape[1] // 2
     # Long enough that the convolution does not wrap around.
     padded = size_bucket(size + kernels.shape[1])
     kernel_spectra = jnp.fft.rfft(kernels, padded)
+    position = jnp.arange(size)
 
-    def features_of(record, n_samples, noise):
-        position = jnp.arange(size)
+    def smooth(record, n_samples):
         # Nothing is extrapolated beyond the last sample.
         is_recorded = position <= (n_samples - 1) * _SUBDIVISIONS
         sample = jnp.arange(record.size, dtype=record.dtype)
         fine = jnp.interp(position.astype(record.dtype) / _SUBDIVISIONS, sample, record)
         fine = jnp.where(is_recorded, fine, 0.0)
         spectra = jnp.fft.rfft(fine, padded)[None, :] * kernel_spectra
-        smooth = jnp.fft.irfft(spectra, padded)[:, half : half + size]
-        wave, mode_wave = jnp.where(is_recorded[None, :], smooth, 0.0)
-        front, back = (threshold * noise for threshold in thresholds)
+        waves = jnp.fft.irfft(spectra, padded)[:, half : half + size]
+        return jnp.where(is_recorded[None, :], waves, 0.0)
 
+    def features_of(wave, mode_wave, noise, thresholds):
+        front, back = (threshold * noise for threshold in thresholds)
         two_in_a_row = jnp.minimum(wave[:-1], wave[1:])
         is_above_front, is_above_back = two_in_a_row > front, two_in_a_row > back
         # The end is the lower of its two samples.
@@ -368,11 +412,13 @@ def _record_features(
 
         is_signal = (position >= first) & (position <= last)
         energy_below = jnp.cumsum(jnp.where(is_signal, wave, 0.0)[::-1])
-        # Noise must not make the cumulated energy fall: the search needs it sorted.
-        fraction = lax.cummax(energy_below) / jnp.maximum(energy_below[-1], jnp.finfo(wave.dtype).tiny)
-        n_below = jnp.searchsorted(fraction, jnp.asarray(_RH_FRACTIONS, fraction.dtype))
-        # All energy lies below the beginning of the signal, whatever rounding makes of the last fraction.
-        rh = jnp.minimum(size - n_below, last).at[-1].set(first)
-        return _RecordFeatures(has_signal, jnp.sum(is_mode), first, last, lowest_mode, rh)
+        return _RecordFeatures(has_signal, jnp.sum(is_mode), first, last, lowest_mode, energy_below)
 
-    return jax.vmap(features_of)(records, n_samples, noise)
+    waves = jax.vmap(smooth)(records, n_samples)
+
+    def with_settings(numbers, thresholds):
+        wave, mode_wave = waves[:, numbers[0]], waves[:, numbers[1]]
+        return jax.vmap(features_of, (0, 0, 0, None))(wave, mode_wave, noise, thresholds)
+
+    # One setting after the other: side by side they need more memory than the processor's caches have.
+    return lax.map(lambda setting: with_settings(*setting), (chosen, thresholds))

@@ -351,8 +351,7 @@ def _estimate(
 
     padded = pad_shots(filled, size=padded_size, is_checked=True)
     estimates: dict[str, np.ndarray] = {}
-    for n in _GROUPS:
-        metrics = metrics_of_records(padded, gedi_settings(n))
+    for n, metrics in zip(_GROUPS, metrics_of_records(padded, [gedi_settings(n) for n in _GROUPS])):
         estimates[f"elev_lowestmode_a{n}"], estimates[f"rh_a{n}"] = metrics.elev_lowestmode, metrics.rh
         if n == group:
             for name in (
