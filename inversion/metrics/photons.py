@@ -42,6 +42,8 @@ _FALSE_ALARM, _FEWEST_NEIGHBOURS = 1e-4, 3
 # Probabilities that background alone passes for ground, of which many places are searched; for canopy; and
 # for photons below the ground.
 _FALSE_GROUND, _FALSE_CANOPY, _FALSE_DEPTH = 1e-4, 1e-3, 1e-3
+# Probability that background alone gives as many photons as a good ground has, anywhere in the window.
+_FALSE_GOOD = 1e-5
 # Height in m of the cells in which background is counted. Cells this many standard deviations above the mean
 # hold signal.
 _CELL_HEIGHT, _CLIP, _CLIP_ITERATIONS = 5.0, 3.0, 30
@@ -150,7 +152,9 @@ def photon_ground_and_canopy(
     The method uses neither pulse nor dead time: where echoes are strong, both heights have the bias of first
     photons. The few photons of a thin top are lost with the noise, so canopies read low by a metre or so
     under sunlight. Light is taken to travel straight down. Under a canopy that lets hardly any photon reach
-    the ground, the ground is the lower edge of what returns, and its quality "doubtful". On slopes of more
+    the ground, the ground is the lower edge of what returns, often but not always "doubtful". Where no
+    surface is certain, a ground is good if background alone would hardly give as many photons anywhere in the
+    window, and else "doubtful". On slopes of more
     than 6 degrees the echo of bare ground is wider than this model has it: with several photons in a pulse
     its upper half passes for low plants, over a ground that is a metre low or more, and both are "doubtful".
 
@@ -227,6 +231,14 @@ def photon_ground_and_canopy(
     near = np.bincount(number[is_near], minlength=n_segments)
     by_background = expected * lengths * 2.0 * _GROUND_RANGE
     fewest = np.maximum(stats.poisson.isf(_FALSE_GROUND, by_background) + 1.0, _DOUBTFUL_PHOTONS)
+    # A good one, unless the dense surface is certain: more than the background gives at any of the places in
+    # the window. A certain surface has more photons than background alone gives to any such slab.
+    slab, window = _SLAB * _SURFACE_STEP, float(np.ptp(photons.window))
+    at_surface = np.abs(photons.z - surface.height_at(photons.x)) <= 0.5 * slab
+    surface_count = np.bincount(number[at_surface], minlength=n_segments)
+    is_certain = surface_count >= _rare_count(expected * lengths * slab, window / slab)
+    rare = _rare_count(by_background, window / (2.0 * _GROUND_RANGE))
+    fewest_good = np.where(is_certain, fewest, rare)
     signal_count = np.bincount(number[is_signal & (above > -_GROUND_RANGE)], minlength=n_segments)
     # Below a canopy of many photons the lower edge counts as ground, if a doubtful one.
     has_ground = (near >= fewest) | (signal_count >= _RICH_SIGNAL * fewest)
@@ -268,6 +280,7 @@ def photon_ground_and_canopy(
             float(ground_stderr[i]),
             int(near[i]),
             float(by_background[i]),
+            int(fewest_good[i]),
             bool(is_deeper[i]),
             bool(may_be_bare[i]),
         )
@@ -595,8 +608,20 @@ def _posterior(evidence: np.ndarray, offsets: np.ndarray) -> np.ndarray:
     return posterior / posterior.sum(axis=1, keepdims=True)
 
 
+def _rare_count(expected: np.ndarray, places: np.ndarray | float) -> np.ndarray:
+    """Return the fewest events that background alone hardly gives at any of so many places."""
+    probability = np.minimum(_FALSE_GOOD / np.maximum(places, 1.0), 1.0)
+    return stats.poisson.isf(probability, expected) + 1.0
+
+
 def _verdict(
-    has_ground: bool, stderr: float, near: int, by_background: float, is_deeper: bool, may_be_bare: bool
+    has_ground: bool,
+    stderr: float,
+    near: int,
+    by_background: float,
+    fewest_good: int,
+    is_deeper: bool,
+    may_be_bare: bool,
 ) -> Verdict:
     """Return the verdict on the ground of a segment."""
     if not has_ground:
@@ -606,6 +631,9 @@ def _verdict(
         verdict &= Verdict("doubtful", (f"standard error {stderr:.2f} m",))
     if near - by_background < _DOUBTFUL_PHOTONS:
         verdict &= Verdict("doubtful", (f"{near} photons in the ground's echo",))
+    elif near < fewest_good:
+        reason = f"{near} photons in the ground's echo: background alone may give them somewhere"
+        verdict &= Verdict("doubtful", (reason,))
     if is_deeper:
         verdict &= Verdict("doubtful", ("photons below the ground",))
     if may_be_bare:

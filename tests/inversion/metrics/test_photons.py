@@ -255,3 +255,58 @@ def test_short_tracks_and_tracks_without_photons_have_rows_too():
     assert len(heights.label) == 0
     short = inversion.photon_ground_and_canopy(events_of(track(0.0), 1e6), DISTANCE, segment=150.0)
     assert short.quality.tolist() == ["good", "good"]
+
+
+def sparse_events(random, rate, per_segment, half_window):
+    """Events of level ground that returns so few photons in 20 m, under background in events per second."""
+    density = 1e-9 * rate * 2.0 / jl.SPEED_OF_LIGHT
+    noise = random.poisson(density * 2.0 * half_window, SHOTS)
+    signal = random.poisson(per_segment * 0.7 / 20.0, SHOTS)
+    heights = random.uniform(-half_window, half_window, noise.sum())
+    height = np.r_[heights, GROUND + 0.15 * random.normal(size=signal.sum())]
+    shot = np.r_[np.repeat(np.arange(SHOTS), noise), np.repeat(np.arange(SHOTS), signal)]
+    order = np.lexsort((-height, shot))
+    zeros = np.zeros(order.size, int)
+    return jl.PhotonEvents(
+        time=-2.0 * height[order] / jl.SPEED_OF_LIGHT,
+        height=height[order],
+        shot=shot[order],
+        pulse=zeros,
+        pixel=zeros,
+        wavelength=np.full(order.size, 532.0),
+        signal=order >= noise.sum(),
+        lost=np.zeros((SHOTS, 1), int),
+        window=np.tile([-half_window, half_window], (SHOTS, 1)),
+        pulses=1,
+    )
+
+
+# Events of background per second, photons of ground in 20 m, and half of the window in m.
+SPARSE = {
+    "background alone": (5e6, 0.0, 50.0),
+    "one photon, by night": (2e4, 1.0, 250.0),
+    "one photon": (5e6, 1.0, 50.0),
+    "two photons, by night": (2e4, 2.0, 250.0),
+    "two photons": (5e6, 2.0, 50.0),
+}
+
+
+def errors_of_good_ones(case, draws):
+    """Errors of the ground of the good segments, over draws."""
+    errors = []
+    for seed in range(draws):
+        events = sparse_events(np.random.default_rng(seed), *SPARSE[case])
+        heights = inversion.photon_ground_and_canopy(events, DISTANCE)
+        errors.append((heights.ground - GROUND)[heights.quality == "good"])
+    return np.concatenate(errors)
+
+
+@pytest.mark.parametrize("case", SPARSE)
+def test_a_ground_of_few_photons_that_is_far_off_is_never_good(case):
+    assert np.all(np.abs(errors_of_good_ones(case, 40)) < 2.0)
+
+
+def test_without_the_number_of_places_a_ground_far_off_is_good(monkeypatch):
+    """Negative control: as if the ground had been sought at one place."""
+    monkeypatch.setattr(photons, "_FALSE_GOOD", np.inf)
+    assert np.any(np.abs(errors_of_good_ones("two photons", 40)) > 20.0)
