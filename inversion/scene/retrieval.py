@@ -23,8 +23,11 @@ bounds say of an unknown by themselves. For independent unit normal numbers e,
 
 has the covariance H^-1: a few such draws estimate the standard error of every value and of every sum of
 values (Papandreou and Yuille 2010; Bardsley et al. 2014, "randomise then optimise"). They need no matrix but
-products with H: each is solved by conjugate gradients. The row of the averaging kernel of value k is e_k^T
-H^-1 J^T J, from one more solution.
+products with H: each is solved by conjugate gradients.
+
+**Averaging kernel.** A value at its bound stays there when the truth changes a little, and the others are
+fitted with it held: its row is zero, and that of a free value k is e_k^T (H_FF)^-1 (J^T J)_F, with the free
+values F, from one more solution. Standard errors are those without bounds, as in `inversion.fit.uncertainty`.
 
 **Source:** Byrd, Lu, Nocedal and Zhu (1995), SIAM J. Sci. Comput. 16, 1190; diagonal by random signs: Bekas,
 Kokiopoulou and Saad (2007), Appl. Numer. Math. 57, 1214; Hansen (2010), Discrete Inverse Problems; Papandreou
@@ -79,6 +82,8 @@ _LEAST_GAIN, _PATIENCE = 1e-3, 10
 _MEMORY, _SCALE_DRAWS = 20, 4
 # Conjugate gradients of a draw of the error: most steps, and relative residual.
 _CG_STEPS, _CG_RTOL = 40, 0.03
+# A value nearer to a bound than this fraction of their width is at the bound.
+_BOUND_MARGIN = 1e-6
 # Standard deviations of a log-normal prior below its median at which a bound of zero is moved.
 _LOG_REACH = 8.0
 # Numbers of entries of a checkpoint: the fit, and draws and kernels from here on.
@@ -256,6 +261,7 @@ def retrieve_scene(
         unknowns=model.all_unknowns,
         values=end.x,
         draws=errors,
+        at_bound=~problem.is_free(end.x),
         kernels=rows,
         kernel_places=places,
         scene=model.scene_at(end.x),
@@ -490,14 +496,30 @@ class _Problem:
         prior = self.priors.pull_back(x, self.priors.push_forward(x, v)) + self.bounds_precision * v
         return self.model.gauss_newton_product(x, v) + prior
 
-    def solve(self, end: "_FitEnd", b: np.ndarray) -> Float[np.ndarray, " n"]:
-        """Return H^-1 b by conjugate gradients, preconditioned by the diagonal of H."""
+    def is_free(self, x: Float[np.ndarray, " n"]) -> Bool[np.ndarray, " n"]:
+        """Return True for values that are not at one of their bounds, where L-BFGS-B puts them exactly."""
+        margin = _BOUND_MARGIN * (self.high - self.low)
+        return (x > self.low + margin) & (x < self.high - margin)
+
+    def solve(
+        self, end: "_FitEnd", b: np.ndarray, is_free: Bool[np.ndarray, " n"] | None = None
+    ) -> Float[np.ndarray, " n"]:
+        """Return H^-1 b by conjugate gradients, preconditioned by the diagonal of H.
+
+        With `is_free`, it is (H_FF)^-1 b_F of the free values, and zero for the others.
+        """
         n = b.size
+        free = np.ones(n) if is_free is None else is_free.astype(float)
+
+        def product(v: np.ndarray) -> np.ndarray:
+            # The identity for values that are held, which keeps the matrix regular.
+            return free * self.product(end.x, free * v) + (1.0 - free) * v
+
         # SciPy's stubs know the constructor of the base class alone, without its functions.
         operator: Any = sparse_linalg.LinearOperator
-        matrix = operator((n, n), matvec=lambda v: self.product(end.x, v), dtype=float)
+        matrix = operator((n, n), matvec=product, dtype=float)
         inverse_diagonal = operator((n, n), matvec=lambda v: end.scale**2 * v, dtype=float)
-        return sparse_linalg.cg(matrix, b, rtol=_CG_RTOL, maxiter=_CG_STEPS, M=inverse_diagonal)[0]
+        return sparse_linalg.cg(matrix, free * b, rtol=_CG_RTOL, maxiter=_CG_STEPS, M=inverse_diagonal)[0]
 
 
 def _best_gains(
@@ -709,8 +731,12 @@ def _averaging_kernels(
     store: _Store,
     progress: Callable[[SceneStep], None] | None,
 ) -> dict[str, Float[np.ndarray, "places ..."]]:
-    """Return rows of the averaging kernel, d estimate / d truth, within the unknown itself."""
+    """Return rows of the averaging kernel, d estimate / d truth, within the unknown itself.
+
+    Rows of values at their bounds are zero.
+    """
     kernels, number = {}, 0
+    is_free = problem.is_free(end.x)
     starts = np.cumsum([0, *problem.model.sizes])
     for start, u in zip(starts, problem.model.all_unknowns):
         if u.name not in places:
@@ -722,8 +748,11 @@ def _averaging_kernels(
             if stored is None:
                 unit = np.zeros(end.x.size)
                 unit[flat] = 1.0
-                # A row of H^-1 J^T J: by symmetry, J^T J times a column of H^-1.
-                row = problem.model.gauss_newton_product(end.x, problem.solve(end, unit))
+                # A row of (H_FF)^-1 (J^T J)_F: by symmetry, J^T J times a column of (H_FF)^-1.
+                row = np.zeros(end.x.size)
+                if is_free[flat]:
+                    column = problem.solve(end, unit, is_free)
+                    row = problem.model.gauss_newton_product(end.x, column)
                 store.add(_FIRST_KERNEL + number, row=row)
             else:
                 row = stored["row"]

@@ -15,8 +15,6 @@ from jaxlidar import Scene
 from jaxlidar.io import save
 from jaxlidar.io.datasets import datasets_of, variables_by_item
 
-# Distance from a bound, over the width of the bounds, at which a value counts as at it.
-_AT_BOUND = 1e-6
 # Values of an unknown beyond which a summary shows quantiles.
 _FEW_VALUES = 8
 
@@ -35,7 +33,9 @@ class SceneRetrieval(eqx.Module):
       of values, is that of the same function of the draws, about zero: see `stderr_of`.
     - `at_bound`: True for values at one of their bounds.
     - `averaging`: (places, ...) rows of the averaging kernel, d estimate at the place / d truth in each value
-      of the unknown. `places`: (places, axes) their indices. Empty where none were asked for.
+      of the unknown. Values at their bounds are held: the row of such a place is zero, and in other rows
+      their elements say how the estimate answers to a truth that they cannot follow. `places`: (places, axes)
+      their indices. Empty where none were asked for.
     - `bounds`: (2, ...) lower and upper bounds.
     - `scene`: the fitted scene.
     - `time`: (samples,) ns. `wavelength`: (wavelengths,) nm.
@@ -150,6 +150,7 @@ def make_scene_retrieval(
     unknowns: Sequence[BoundUnknown],
     values: Float[np.ndarray, " n"],
     draws: Float[np.ndarray, "draws n"],
+    at_bound: Bool[np.ndarray, " n"],
     kernels: Mapping[str, np.ndarray],
     kernel_places: Mapping[str, np.ndarray],
     scene: Scene,
@@ -159,17 +160,12 @@ def make_scene_retrieval(
     bounds = bounds_by_name(unknowns)
     by_name = split_by_name(values, unknowns)
     stderr = np.sqrt(np.mean(draws**2, axis=0)) if len(draws) else np.full(values.size, np.nan)
-    at_bound = {}
-    for name, value in by_name.items():
-        low, high = bounds[name]
-        margin = _AT_BOUND * (high - low)
-        at_bound[name] = (value <= low + margin) | (value >= high - margin)
     static = {name: quantities.pop(name) for name in ("converged", "status")}
     arrays = {
         "values": by_name,
         "stderr": split_by_name(stderr, unknowns),
         "draws": split_by_name(draws, unknowns),
-        "at_bound": at_bound,
+        "at_bound": split_by_name(at_bound, unknowns),
         "averaging": dict(kernels),
         "places": dict(kernel_places),
         "bounds": bounds,

@@ -1,6 +1,7 @@
 """Retrieval of one scene from many records: Jacobians, priors, stopping, errors, checkpoints."""
 
 import dataclasses
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -10,7 +11,9 @@ import pytest
 import inversion
 import jaxlidar as jl
 from inversion.fit.planning import TraceSizes, plan_for_bounds
+from inversion.fit.uncertainty import estimate_covariance
 from inversion.fit.unknowns import bind_unknowns, flat_start
+from inversion.scene import retrieval
 from inversion.scene.map_priors import MapPriors
 from inversion.scene.retrieval import _shot_groups, no_longer_falls
 from inversion.scene.survey_model import SurveyModel
@@ -100,9 +103,11 @@ def test_total_leaf_area_is_better_determined_than_voxels(small_stand):
     error_of_voxel = float(np.median(np.asarray(fit.stderr["leaf"]))) / float(fit.values["leaf"].mean())
     assert 0.0 < error_of_total < 0.2
     assert error_of_voxel > 0.5
-    # The kernel spreads over the footprint, and lies about its own height.
-    kernel = np.asarray(fit.averaging["leaf"][0])
-    assert 0.5 < kernel.sum() < 1.5
+    # The kernel spreads over the footprint, and lies about its own height. Values at the bound of zero cannot
+    # follow the truth: it sums to about one over the others.
+    kernel, at_bound = np.asarray(fit.averaging["leaf"][0]), np.asarray(fit.at_bound["leaf"])
+    assert not at_bound[3, 3, 7]
+    assert 0.5 < kernel[~at_bound].sum() < 1.5
     assert abs(kernel.sum(axis=(0, 1)).argmax() - 7) <= 1
 
 
@@ -361,6 +366,65 @@ def test_standard_errors_are_those_of_the_inverse_of_the_matrix():
         assert float(fit.stderr[name]) == pytest.approx(error, rel=0.27)
     truth = {"height": 0.3, "brightness": 0.4}
     assert all(abs(float(fit.values[n]) - truth[n]) < 4.0 * float(fit.stderr[n]) for n in truth)
+
+
+def test_averaging_kernels_hold_values_at_their_bounds():
+    random = np.random.default_rng(2)
+    jacobian = random.normal(size=(30, 6)) + random.normal(size=(30, 1))
+    precision, width = np.diag(random.uniform(1.0, 20.0, 6)), np.full(6, 100.0)
+    matrix = jacobian.T @ jacobian + precision
+    at_bound = np.array([False, True, False, False, True, False])
+    problem = SimpleNamespace(product=lambda x, v: matrix @ v)
+    end = SimpleNamespace(x=np.zeros(6), scale=1.0 / np.sqrt(np.diag(matrix)))
+
+    def rows(is_free):
+        columns = [retrieval._Problem.solve(problem, end, unit, is_free) for unit in np.eye(6)]
+        return np.stack(columns) @ jacobian.T @ jacobian
+
+    # Those of fits of single records.
+    estimate = estimate_covariance(jacobian, precision, width, np.ones(30), None, at_bound=at_bound)
+    np.testing.assert_allclose(rows(~at_bound), estimate.averaging, atol=0.02)
+    np.testing.assert_array_equal(rows(~at_bound)[at_bound], 0.0)
+    # Negative control: with all values free, other rows change too.
+    assert np.abs(rows(None) - estimate.averaging)[~at_bound].max() > 0.1
+
+
+@pytest.mark.slow
+def test_a_value_at_its_bound_has_no_averaging_kernel():
+    x = np.arange(0.0, 31.0, 5.0)
+    brightness = 0.3 + 0.1 * np.sin(x / 5.0)[:, None] * np.ones_like(x)
+
+    heights = np.sin(x / 6.0)[:, None] + np.cos(x / 8.0)
+
+    def terrain(reflectance):
+        return jl.Scene(ground=jl.Terrain(heights, spacing=5.0, origin=(0.0, 0.0), reflectance=reflectance))
+
+    lidar = jl.Lidar(altitude=1000.0, divergence=3.0, pulse=jl.GaussianPulse(4.0))
+    survey = jl.Survey.grid(lidar, (5.0, 5.0), (25.0, 25.0), 2.5)
+    waves = jl.simulate_many(survey, terrain(brightness), key=jax.random.key(0), max_orders=1)
+    observed, noise = with_noise(waves)
+    # The first place has 0.39, beyond the bound, and the second has 0.2.
+    unknown = inversion.Unknown(
+        "ground.reflectance", bounds=(0.05, 0.32), name="brightness", prior=inversion.MarkovField(0.2)
+    )
+    fit = inversion.retrieve_scene(
+        observed,
+        survey,
+        terrain(np.full_like(brightness, 0.25)),
+        [unknown],
+        noise=noise,
+        time=waves.time,
+        key=KEY,
+        max_orders=1,
+        draws=0,
+        kernels={"brightness": [(2, 3), (5, 3)]},
+    )
+    at_bound = np.asarray(fit.at_bound["brightness"])
+    assert at_bound[2, 3]
+    assert not at_bound[5, 3]
+    held, free = np.asarray(fit.averaging["brightness"])
+    assert np.all(held == 0.0)
+    assert free[5, 3] == free.max() > 0.3
 
 
 @pytest.mark.slow
