@@ -39,6 +39,7 @@ from jaxlidar.spectral.apply_optics import (
     make_padded_waveform_model,
     make_waveform_model,
 )
+from jaxlidar.spectral.pulse_convolution import PulseConvolution
 from jaxlidar.spectral.truth_class import Truth
 from jaxlidar.trace.deposit import add_rows, padded_index
 from jaxlidar.trace.device_scene import DeviceScene, build_device_scene
@@ -177,6 +178,8 @@ _compiled_labels = Program(compute_labels)
 
 def _sample_bins(scene: DeviceScene, model: WaveformModel) -> TimeBins:
     """Return the samples as time bins."""
+    # Models of simulations have samples of whole fine bins.
+    assert isinstance(model.convolution, PulseConvolution)
     fine, bins_per_sample = scene.bins, model.convolution.bins_per_sample
     # A ray segment spans at most so many fine bins.
     longest = fine.max_span - 2

@@ -33,7 +33,7 @@ def blocks(path, language):
 LONG = {
     "README.md": {3},
     "jaxlidar/README.md": {0, 1, 2, 3, 5, 8, 9},
-    "inversion/README.md": {2, 3},
+    "inversion/README.md": {2, 3, 4},
 }
 EXAMPLES = [
     pytest.param(path, number, marks=pytest.mark.slow if number in LONG.get(page_name(path), ()) else ())

@@ -9,11 +9,17 @@ A cost of the bound, such as the sum of the relative variances (A-optimality), i
 gradient, which holds mixed second derivatives of the waveform by unknowns and design.
 
 Light is traced once for each scene. The response R and its derivatives by the unknowns do not depend on what
-acts after the trace: wavelengths, pulse, energies and jitter. So for every design,
+acts after the trace: wavelengths, pulse, energies, jitter and sampling. So for every design,
 
     J(d) = dw / dR . dR / dx + dw / dx at constant R,   w = w(R, x, d),
 
-is a small matrix product, by forward mode; JAX differentiates it by d in reverse mode.
+is a small matrix product, by forward mode; JAX differentiates it by d in reverse mode. The divergence changes
+R: it is traced at several divergences, and interpolated between them (`inversion.fit.design_trace`).
+
+**Sampling.** The samples of a record follow one another without gaps: each is the energy of its interval.
+The number of samples is fixed, by the shortest interval within the limits, so that the record is a
+differentiable function of the interval. Samples after the last light hold no information: the bound is that
+of a record of any length that contains all light.
 
 The bound is computed by the QR decomposition of the whitened Jacobian: squared, its condition number would
 exceed single precision. The optimiser is L-BFGS-B (Byrd et al. 1995, SIAM J. Sci. Comput. 16, 1190) of the
@@ -23,6 +29,8 @@ logarithm of the cost, from several starts.
 """
 
 import dataclasses
+import math
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple, final
 
@@ -32,34 +40,48 @@ import jax.flatten_util
 import jax.numpy as jnp
 import jax.scipy.linalg
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float, PRNGKeyArray
+from jaxtyping import Array, ArrayLike, Bool, Float, PRNGKeyArray
 from scipy import optimize
 
 from inversion.fit.data import with_fixed_window
+from inversion.fit.design_trace import DivergenceNodes, TracedScene, refine_nodes, trace_for_design
 from inversion.fit.identifiability import CramerRao
-from inversion.fit.model import SimulationInputs, Values
 from inversion.fit.planning import N_BATCHES
-from inversion.fit.prior_residuals import fixed_priors
 from inversion.fit.unknowns import (
-    BoundUnknown,
+    Setter,
     Unknown,
     bind_unknowns,
-    flat_bounds,
     flat_labels,
-    flat_start,
+    locate_lidar_array,
+    set_lidar_values,
+    split_values,
 )
-from jaxlidar import Lidar, Plan, Response, Scene, plan_scenes, total_reflectance, trace_scene
+from jaxlidar import Lidar, Plan, Response, Scene
 from jaxlidar.extend import as_numpy, check_integer, check_key, check_kind, check_kinds, check_range
+from jaxlidar.planning.effects import effects_of_family
+from jaxlidar.planning.scene_family import plan_cases
 
-# Fields of a lidar that act after the trace, of which `inversion.fit.unknowns` names those that records
-# determine.
-_ADMISSIBLE_FIELDS = ("wavelength", "pulse", "energy", "efficiency", "jitter")
+# Fields of a lidar that can be free: those that act after the trace, of which `inversion.fit.unknowns` names
+# those that records determine, and the divergence, which is interpolated.
+_ADMISSIBLE_FIELDS = (
+    *("wavelength", "pulse", "energy", "efficiency", "jitter", "sampling_interval"),
+    "divergence",
+)
+# Those of which a value of zero, or its logarithm, is not admissible.
+_POSITIVE_FIELDS = ("sampling_interval", "divergence")
 # Bounds of wavelengths, nm: those of the leaf models. Of other values: this factor about those of the lidar.
 _WAVELENGTHS, _DEFAULT_FACTOR = (400.0, 2500.0), 4.0
 # Default noise, as a fraction of the largest sample.
 _NOISE_FRACTION = 0.01
 # Precision that all unknowns have, in widths of their bounds, so that bounds of undetermined ones are finite.
 _LEAST_PRECISION = 1e-6
+# Divergences of the first traces, and the most.
+_FIRST_NODES, _MAX_NODES = 9, 33
+# Relative errors of the cost between divergences down to which there are more of them: over all limits, where
+# the minima have to be told apart, and within a factor of the best one.
+_COARSE_TOLERANCE, _FINE_TOLERANCE, _NEAR_BEST = 0.1, 0.01, 1.5
+# The error counts up to so many times the lowest cost.
+_NEAR_LOWEST = 4.0
 # Cost of a design that is not finite, such as one of two equal wavelengths; of its logarithm.
 _REJECTED_COST = 1e6
 
@@ -106,46 +128,33 @@ class Design(eqx.Module):
 
 
 class FreeValues(NamedTuple):
-    """Free values of a lidar: paths, indices among its pytree leaves, shapes, and bounds as flat vectors."""
+    """Free values of a lidar: paths, setters and shapes, and bounds as flat vectors."""
 
     paths: tuple[str, ...]
-    indices: tuple[int, ...]
+    setters: tuple[Setter, ...]
     shapes: tuple[tuple[int, ...], ...]
     low: Float[np.ndarray, " n"]
     high: Float[np.ndarray, " n"]
 
-    def split(self, flat: Any) -> list[Any]:
-        """Return the values of each path from one vector."""
-        ends = np.cumsum([int(np.prod(shape)) for shape in self.shapes])
-        # NumPy's `split` does not take tracers.
-        pieces = [flat[end - int(np.prod(shape)) : end] for end, shape in zip(ends, self.shapes)]
-        return [piece.reshape(shape) for piece, shape in zip(pieces, self.shapes)]
+    def of(self, lidar: Lidar) -> list[Array | np.ndarray]:
+        """Return the free values of a lidar."""
+        return [
+            locate_lidar_array(path, lidar, _ADMISSIBLE_FIELDS, argument="free")[1] for path in self.paths
+        ]
 
     def lidar_with(self, lidar: Lidar, flat: Array) -> Lidar:
         """Return the lidar with these values; wavelengths are put in order."""
-        leaves, structure = jax.tree.flatten(lidar)
-        for path, index, value in zip(self.paths, self.indices, self.split(flat)):
-            # Which wavelength is the first does not matter: the noise is that of the record.
-            leaves[index] = jnp.sort(value) if path == "wavelength" else value
-        return jax.tree.unflatten(structure, leaves)
+        # Which wavelength is the first does not matter: the noise is that of the record.
+        values = tuple(
+            jnp.sort(value) if path == "wavelength" else value
+            for path, value in zip(self.paths, split_values(flat, self.shapes))
+        )
+        return set_lidar_values(lidar, self.setters, values)
 
-
-class _TracedScene(eqx.Module):
-    """One scene of a design: its response, the derivatives of that, and what the bound needs besides.
-
-    - `inputs`, `values`: of the simulation at the unknowns' starting values.
-    - `response`, `slopes`: the mean response, and its derivatives; the latter with a leading axis of
-      unknowns, zeros for those that do not change it.
-    - `width`: of the bounds of the flattened unknowns. `prior_rows`: whitened Jacobian of the priors, in
-      widths.
-    """
-
-    inputs: SimulationInputs
-    values: Values
-    response: Response
-    slopes: Response
-    width: Float[Array, " n"]
-    prior_rows: Float[Array, "rows n"]
+    def is_value_of(self, path: str) -> Bool[np.ndarray, " n"]:
+        """Return True for the elements of the flat vectors that are values of a path."""
+        sizes = [int(np.prod(shape)) for shape in self.shapes]
+        return np.repeat(np.array(self.paths) == path, sizes)
 
 
 def design(
@@ -164,27 +173,37 @@ def design(
     n_photons: int = 65536,
     n_rays: int | None = None,
 ) -> Design:
-    """Find the wavelengths, pulse and energies of a lidar that determine unknowns of scenes best.
+    """Find the wavelengths, pulse, energies, divergence and sampling of a lidar that determine unknowns best.
 
     The cost of the Cramer-Rao bounds, its mean over the scenes, is minimised by its gradient. Light is
-    traced once for each scene, so that a step takes milliseconds.
+    traced once for each scene, so that a step takes milliseconds. With a free divergence it is traced at
+    nine divergences within the limits or more, until the cost between them is known to 1 %.
+
+    Where footprints or shots lie is no value of a lidar, and their number no smooth one. Compare spacings by
+    a list of them: records of separate shots add to the information, `CramerRao.information`, of
+    `cramer_rao` with a lidar at each position.
 
     **Arguments:**
 
     - `lidar`: the instrument; its values are the first start.
     - `scenes`: a `Scene`, or several of one structure, at whose values the bounds are taken.
     - `unknowns`: as for `cramer_rao`, the same for all scenes; priors count.
-    - `free`: paths of the lidar's arrays that are free: "wavelength", "energy", "efficiency", "jitter", and
-      values of the pulse such as "pulse.fwhm". Default ("wavelength", "pulse.fwhm").
-    - `limits`: (low, high) by path, numbers or arrays that broadcast to the value. Default None, or where a
-      path is missing: 400 to 2500 nm for wavelengths, a factor of 4 about the lidar's value for others.
+    - `free`: paths of the lidar's arrays that are free: "wavelength", "energy", "efficiency", "jitter",
+      "divergence", "sampling_interval", and values of the pulse such as "pulse.fwhm". Default ("wavelength",
+      "pulse.fwhm").
+    - `limits`: (low, high) by path, numbers or arrays that broadcast to the value; above 0 for divergence and
+      sampling interval. Default None, or where a path is missing: 400 to 2500 nm for wavelengths, a factor of
+      4 about the lidar's value for others.
     - `cost`: a function of a `CramerRao` of JAX arrays, to a positive scalar, differentiable, such as
       `lambda bound: bound.stderr["Cab"] ** 2`. Default None: the sum over unknowns of the squared standard
       error over the width of the bounds.
-    - `noise`: standard deviation of the apparent reflectance, above 0, anything that broadcasts to
+    - `noise`: standard deviation of the apparent reflectance of a sample, above 0, which broadcasts to
       (wavelengths, bins); or a differentiable function `noise(lidar, reflectance)` of the candidate and its
-      waveform, such as that of a receiver whose noise falls with the energy. Default None: 1 % of the
-      largest sample by `lidar` of each scene.
+      waveform, such as that of a receiver whose noise falls with the energy. With a free sampling interval,
+      it is a number, one by wavelength (wavelengths, 1), or a function; a number holds for samples of any
+      length, as the electronic noise of a `Receiver` does. Default None: 1 % of the largest sample by `lidar`
+      of each scene; with a free sampling interval, times the root of the interval over that of `lidar`, as
+      white noise collected over a sample has.
     - `starts`: starting points: the first is `lidar`, others are drawn evenly within the limits. Default 4.
     - `max_steps`: steps of the optimiser from each start. Default 100.
     - `key`: a JAX random key, for photons and starts. Default None: `jax.random.key(0)`; all designs are
@@ -194,9 +213,14 @@ def design(
 
     **Returns:** a `Design`.
 
-    **Raises:** ValueError for inadmissible arguments, among them paths that are no array of the lidar or act
-    on the paths of light, scenes of different structure, and leaves that transmit straight on with free
-    wavelengths. TypeError for arguments of another kind.
+    Echoes that fall within one sample or astride two differ in what they tell. With long samples, give scenes
+    of several heights, so that the design does not depend on it.
+
+    **Raises:** ValueError for inadmissible arguments, among them paths that are no array of the lidar or that
+    cannot be free, scenes of different structure, and leaves that transmit straight on with free wavelengths.
+    TypeError for arguments of another kind.
+
+    **Warns:** `UserWarning` where the cost depends on the divergence in more detail than it was traced.
 
     **Example:** the wavelength that tells chlorophyll best lies at an edge of its absorption.
 
@@ -226,30 +250,47 @@ def design(
     if "wavelength" in free_values.paths:
         _check_wavelengths_act_late(scenes)
     plan = _plan(lidar, scenes, free_values, max_orders, n_photons, n_rays)
+    n_samples = _number_of_samples(plan, free_values)
     photon_key, start_key = jax.random.split(key)
-    traced_scenes = [
-        _trace(lidar, scene, plan, bound, photon_key) for scene, bound in zip(scenes, bound_unknowns)
+
+    def trace(lidar: Lidar, nodes: DivergenceNodes | None) -> list[TracedScene]:
+        return [
+            trace_for_design(lidar, scene, plan, bound, photon_key, n_samples=n_samples, nodes=nodes)
+            for scene, bound in zip(scenes, bound_unknowns)
+        ]
+
+    traced_scenes = trace(lidar, None)
+    noises = [
+        noise if callable(noise) else _noise_of_samples(noise, traced, plan) for traced in traced_scenes
     ]
-    noises = [noise if callable(noise) else _noise_array(noise, traced, plan) for traced in traced_scenes]
     names = tuple(unknown.name for unknown in bound_unknowns[0])
     shapes = tuple(unknown.start.shape for unknown in bound_unknowns[0])
     labels = flat_labels(bound_unknowns[0])
     cost_of_bound = _relative_variance(traced_scenes[0].width) if cost is None else cost
 
     @eqx.filter_jit
-    def bound_of(flat: Array, traced: _TracedScene, scene_noise: Any) -> CramerRao:
+    def bound_of(flat: Array, traced: TracedScene, scene_noise: Any) -> CramerRao:
         return _cramer_rao(free_values.lidar_with(lidar, flat), traced, scene_noise, names, shapes, labels)
 
+    def cost_at(flat: Array, traced: TracedScene, scene_noise: Any) -> Array:
+        return jnp.asarray(cost_of_bound(bound_of(flat, traced, scene_noise))).reshape(())
+
     @eqx.filter_jit
-    def cost_and_slopes(fraction: Array, traced: _TracedScene, scene_noise: Any) -> tuple[Array, Array]:
+    def cost_and_slopes(fraction: Array, traced: TracedScene, scene_noise: Any) -> tuple[Array, Array]:
         def of_fraction(fraction: Array) -> Array:
             low, high = jnp.asarray(free_values.low), jnp.asarray(free_values.high)
-            value = cost_of_bound(bound_of(low + fraction * (high - low), traced, scene_noise))
-            return jnp.asarray(value).reshape(())
+            return cost_at(low + fraction * (high - low), traced, scene_noise)
 
         return jax.value_and_grad(of_fraction)(fraction)
 
-    def log_mean_cost(fraction: np.ndarray) -> tuple[float, np.ndarray]:
+    def mean_cost(flat: np.ndarray, traced_scenes: list[TracedScene]) -> float:
+        pairs = zip(traced_scenes, noises)
+        return float(np.mean([float(cost_at(jnp.asarray(flat), *pair)) for pair in pairs]))
+
+    start = np.concatenate([np.ravel(np.asarray(value, float)) for value in free_values.of(lidar)])
+    initial_cost = mean_cost(start, traced_scenes)
+
+    def log_mean_cost(fraction: np.ndarray, traced_scenes: list[TracedScene]) -> tuple[float, np.ndarray]:
         """Return the logarithm of the mean cost over scenes, and its gradient by fractions of the limits."""
         terms = [cost_and_slopes(jnp.asarray(fraction), *pair) for pair in zip(traced_scenes, noises)]
         mean = float(np.mean([float(value) for value, _ in terms]))
@@ -261,41 +302,114 @@ def design(
         # Variances span orders of magnitude over the limits: their logarithm has even steps.
         return float(np.log(mean)), slopes / mean
 
-    width = free_values.high - free_values.low
-    leaves = jax.tree.leaves(lidar)
-    start = np.concatenate([np.ravel(np.asarray(leaves[index], float)) for index in free_values.indices])
-    first = (start - free_values.low) / width
-    initial_log_cost = log_mean_cost(first)[0]
-    drawn = np.asarray(jax.random.uniform(start_key, (starts - 1, first.size)), float)
-    # The cost has minima at each absorption band: one start would end in the next of them.
-    ends = [
-        optimize.minimize(
+    def minimise(
+        fraction: np.ndarray, traced_scenes: list[TracedScene], lower: np.ndarray, upper: np.ndarray
+    ) -> Any:
+        return optimize.minimize(
             log_mean_cost,
-            start,
+            fraction,
+            args=(traced_scenes,),
             jac=True,
             method="L-BFGS-B",
-            bounds=[(0.0, 1.0)] * first.size,
+            bounds=np.stack([lower, upper], axis=1),
             options={"maxiter": max_steps},
         )
-        for start in [first, *drawn]
-    ]
+
+    def trace_divergences(
+        lower: np.ndarray, upper: np.ndarray, flat: np.ndarray, tolerance: float
+    ) -> list[TracedScene]:
+        """Trace divergences between fractions of the limits, until the cost is known between them.
+
+        `flat`: values of which all others are used.
+        """
+        low, high = ((free_values.low + end * width)[is_divergence] for end in (lower, upper))
+
+        def cost_at(divergence: float, traced_scenes: list[TracedScene]) -> float:
+            return mean_cost(np.where(is_divergence, divergence, flat), traced_scenes)
+
+        nodes = DivergenceNodes(float(low[0]), float(high[0]), _FIRST_NODES)
+        return _refined(trace(lidar, nodes), cost_at, photon_key, tolerance)
+
+    width = free_values.high - free_values.low
+    first = (start - free_values.low) / width
+    is_divergence = free_values.is_value_of("divergence")
+    lower, upper = np.zeros_like(first), np.ones_like(first)
+    if np.any(is_divergence):
+        traced_scenes = trace_divergences(lower, upper, start, _COARSE_TOLERANCE)
+    drawn = np.asarray(jax.random.uniform(start_key, (starts - 1, first.size)), float)
+    # The cost has minima at each absorption band: one start would end in the next of them.
+    ends = [minimise(fraction, traced_scenes, lower, upper) for fraction in [first, *drawn]]
+    costs = np.exp([end.fun for end in ends])
     best: Any = min(ends, key=lambda end: end.fun)
     if best.fun >= _REJECTED_COST:
         raise ValueError("the cost is not a finite positive number at any start; see cost and unknowns")
+    if np.any(is_divergence):
+        # Once more from the best, between divergences near it: there the interpolation is accurate.
+        flat = free_values.low + best.x * width
+        near_low, near_high = (
+            np.clip((flat * factor - free_values.low) / width, 0.0, 1.0)
+            for factor in (1.0 / _NEAR_BEST, _NEAR_BEST)
+        )
+        lower, upper = np.where(is_divergence, near_low, lower), np.where(is_divergence, near_high, upper)
+        traced_scenes = trace_divergences(lower, upper, flat, _FINE_TOLERANCE)
+        best = minimise(best.x, traced_scenes, lower, upper)
     flat = free_values.low + np.clip(best.x, 0.0, 1.0) * width
     best_lidar = free_values.lidar_with(lidar, jnp.asarray(flat))
+    best_cost = float(np.exp(best.fun))
+    if np.any(is_divergence):
+        # Traced at the divergence that was found: without the error of the interpolation.
+        traced_scenes = trace(best_lidar, None)
+        best_cost = mean_cost(flat, traced_scenes)
     return Design(
         lidar=best_lidar,
         values={
-            path: np.asarray(jax.tree.leaves(best_lidar)[index], float)
-            for path, index in zip(free_values.paths, free_values.indices)
+            path: np.asarray(value, float)
+            for path, value in zip(free_values.paths, free_values.of(best_lidar))
         },
-        cost=float(np.exp(best.fun)),
-        initial_cost=float(np.exp(initial_log_cost)) if initial_log_cost < _REJECTED_COST else float("inf"),
+        cost=best_cost,
+        initial_cost=initial_cost if np.isfinite(initial_cost) else float("inf"),
         bounds=tuple(bound_of(jnp.asarray(flat), *pair) for pair in zip(traced_scenes, noises)),
-        costs=np.exp([end.fun for end in ends]) if best.fun < _REJECTED_COST else np.full(starts, np.inf),
+        costs=costs,
         converged=bool(best.success),
     )
+
+
+def _refined(
+    traced_scenes: list[TracedScene],
+    cost_at: Callable[[float, list[TracedScene]], float],
+    key: PRNGKeyArray,
+    tolerance: float,
+) -> list[TracedScene]:
+    """Trace more divergences until the cost between them is interpolated to the tolerance.
+
+    The error is that at each new node, of the interpolation between those before. It counts where the cost is
+    not far above the lowest one: elsewhere, divergences that tell little have large relative errors.
+
+    `cost_at`: cost by divergence and traced scenes.
+    """
+    while True:
+        refined = [refine_nodes(traced, key) for traced in traced_scenes]
+        nodes: Any = refined[0].nodes
+        interpolated, exact = (
+            np.array([cost_at(divergence, scenes) for divergence in nodes.divergences[1::2]])
+            for scenes in (traced_scenes, refined)
+        )
+        # Not finite where no record determines an unknown: no design has such a divergence.
+        lowest = np.minimum(interpolated, exact)
+        is_near = lowest < _NEAR_LOWEST * np.min(exact[np.isfinite(exact)], initial=np.inf)
+        errors = np.abs(interpolated[is_near] / exact[is_near] - 1.0)
+        error = float(np.max(errors, initial=0.0))
+        traced_scenes = refined
+        if error < tolerance:
+            return traced_scenes
+        if nodes.count >= _MAX_NODES:
+            warnings.warn(
+                f"the cost between the {nodes.count} divergences that were traced is known to {error:.1%} "
+                "only: the divergence found may not be the best; narrower limits, or more rays or photons, "
+                "help",
+                stacklevel=4,
+            )
+            return traced_scenes
 
 
 def _checked_scenes(scenes: Any) -> Sequence[Scene]:
@@ -312,28 +426,25 @@ def _free_values(lidar: Lidar, free: Any, limits: dict[str, Any]) -> FreeValues:
     check_kind("free", free, Sequence, "a sequence of paths")
     if isinstance(free, str) or len(free) == 0 or len(set(free)) < len(free):
         raise ValueError(f"free = {free!r} is no sequence of one path or more, each of them once")
-    leaves = jax.tree_util.tree_leaves_with_path(lidar)
-    paths = [jax.tree_util.keystr(path).lstrip(".") for path, _ in leaves]
-    admissible = [path for path in paths if path.split(".")[0] in _ADMISSIBLE_FIELDS]
-    indices, shapes, lows, highs = [], [], [], []
+    setters, shapes, lows, highs = [], [], [], []
     for path in free:
-        if path not in admissible:
-            raise ValueError(f"free = {path!r}; admissible are {', '.join(map(repr, admissible))}")
-        index = paths.index(path)
-        value = np.asarray(leaves[index][1], float)
+        index, array = locate_lidar_array(path, lidar, _ADMISSIBLE_FIELDS, argument="free")
+        value = np.asarray(array, float)
         default = (value / _DEFAULT_FACTOR, value * _DEFAULT_FACTOR)
         low, high = limits.pop(path, _WAVELENGTHS if path == "wavelength" else default)
         low, high = (np.broadcast_to(as_numpy(end, f"limits of {path}"), value.shape) for end in (low, high))
         if not (np.all(np.isfinite(low)) and np.all(np.isfinite(high)) and np.all(low < high)):
             raise ValueError(f"limits of {path} = ({low.tolist()}, {high.tolist()}) are not low < high")
+        if path in _POSITIVE_FIELDS:
+            check_range(f"lower of limits of {path}", low, 0.0, low_open=True)
         check_range(f"{path} of lidar, in its limits,", (value - low) / (high - low), 0.0, 1.0)
-        indices.append(index)
+        setters.append(Setter(index, None, "optical", of_lidar=True))
         shapes.append(value.shape)
         lows.append(low.ravel())
         highs.append(high.ravel())
     if limits:
         raise ValueError(f"limits has {', '.join(map(repr, limits))}, which free does not have")
-    return FreeValues(tuple(free), tuple(indices), tuple(shapes), np.concatenate(lows), np.concatenate(highs))
+    return FreeValues(tuple(free), tuple(setters), tuple(shapes), np.concatenate(lows), np.concatenate(highs))
 
 
 def _check_wavelengths_act_late(scenes: Sequence[Scene]) -> None:
@@ -354,85 +465,59 @@ def _plan(
     n_photons: int,
     n_rays: int | None,
 ) -> Plan:
-    """Plan for all scenes and for the shortest and the longest pulse within the limits.
+    """Plan for all scenes with all free values at their lower limits, and with all at their upper ones.
 
-    Fine bins are those of the shortest pulse; the window and the pulse's support are those of the longest.
+    Fine bins are those of the shortest pulse and samples; the window and the pulse's support are those of the
+    longest pulse, and paths those of the widest beam.
     """
-    lowest, highest = (free_values.lidar_with(lidar, jnp.asarray(end)) for end in free_values[3:])
-    options = {
+    options: dict[str, Any] = {
         "n_photons": -(-check_integer("n_photons", n_photons, N_BATCHES) // N_BATCHES),
         "n_rays": n_rays,
         "histories": True,
+        "max_orders": max_orders,
+        "effects": effects_of_family(scenes),
     }
-    # Two wavelengths that start from one limit are equal: those of the lidar itself serve here.
-    lowest, highest = (dataclasses.replace(end, wavelength=lidar.wavelength) for end in (lowest, highest))
-    trials = [plan_scenes(end, scenes, max_orders=max_orders, **options) for end in (lowest, highest)]
-    start = min(trial.sample_start for trial in trials)
-    end = max(trial.sample_start + trial.sample_interval * (trial.n_samples - 1) for trial in trials)
-    common = {"window": (start, end + 1e-3 * trials[0].sample_interval), **options}
-    common["max_orders"] = max(trial.orders for trial in trials)
-    plans = [plan_scenes(trial_lidar, scenes, **common) for trial_lidar in (lowest, highest)]
-    finest = min(plans, key=lambda candidate: candidate.bins.width)
-    supports = [candidate.pulse_support for candidate in plans]
-    support = (min(low for low, _ in supports), max(high for _, high in supports))
-    return dataclasses.replace(finest, pulse_support=support)
+    ends = [free_values.lidar_with(lidar, jnp.asarray(end)) for end in (free_values.low, free_values.high)]
+    # Two wavelengths that start from one limit are equal: those of the lidar itself serve here. Plans that
+    # are united have one sampling interval.
+    own = {"wavelength": lidar.wavelength, "sampling_interval": lidar.sampling_interval}
+    cases = [(dataclasses.replace(end, **own), scene) for end in ends for scene in scenes]
+    if "sampling_interval" in free_values.paths:
+        shortest = dataclasses.replace(ends[0], wavelength=lidar.wavelength)
+        finest = plan_cases([(shortest, scene) for scene in scenes], window=None, **options)
+        options["bin_width"] = finest.bins.width
+    return plan_cases(cases, window=None, **options)
 
 
-def _trace(
-    lidar: Lidar, scene: Scene, plan: Plan, unknowns: list[BoundUnknown], key: PRNGKeyArray
-) -> _TracedScene:
-    """Trace one scene, with derivatives of its response by the unknowns that change it."""
-    # Scores do not serve here: they give derivatives of the waveform of one lidar, not of the response.
-    setters = tuple(
-        u.setter._replace(dependence="geometric") if u.setter.changes_response else u.setter for u in unknowns
-    )
-    inputs = SimulationInputs(lidar, scene, plan, setters, tangents_per_pass=1)
-    values = tuple(u.start for u in unknowns)
-    keys = jax.random.split(key, N_BATCHES if plan.is_random else 1)
-    response, slopes = _response_and_slopes(inputs, values, keys)
-    priors, start = fixed_priors(unknowns), flat_start(unknowns)
-    low, high = flat_bounds(unknowns)
-    width = high - low
-    return _TracedScene(
-        inputs,
-        values,
-        response,
-        slopes,
-        jnp.asarray(width),
-        jnp.asarray(priors(start)[1] * width),
-    )
+def _number_of_samples(plan: Plan, free_values: FreeValues) -> int | None:
+    """Return the number of the shortest samples within the limits that cover the plan's window.
+
+    None if the sampling interval is not free.
+    """
+    is_interval = free_values.is_value_of("sampling_interval")
+    if not np.any(is_interval):
+        return None
+    shortest = float(free_values.low[is_interval][0])
+    return math.ceil((plan.n_samples - 1) * plan.sample_interval / shortest - 1e-6) + 1
 
 
-@eqx.filter_jit
-def _response_and_slopes(inputs: SimulationInputs, values: Values, keys: Array) -> tuple[Response, Response]:
-    """Return the mean response of all batches, and its derivatives by all flattened unknowns."""
-    flat, restore = jax.flatten_util.ravel_pytree(values)
-    changes = np.concatenate(
-        [np.full(v.size, s.changes_response) for v, s in zip(values, inputs.setters)]
-    ).astype(float)
+def _noise_of_samples(
+    noise: Any, traced: TracedScene, plan: Plan
+) -> Float[Array, "wavelengths bins"] | Callable[[Lidar, Array], Array]:
+    """Return the noise of each sample, or the function that gives it.
 
-    def response_of(flat: Array) -> Response:
-        setup = inputs.setup(restore(flat))
-        responses = jax.lax.map(lambda batch_key: trace_scene(setup, batch_key, reverse=False), keys)
-        return jax.tree.map(lambda a: jnp.mean(a, axis=0), responses)
-
-    def slope(direction: Array) -> Response:
-        return jax.jvp(response_of, (flat,), (direction,))[1]
-
-    # One column after the other: the tangents of a response, with all histories, are large.
-    directions = jnp.diag(jnp.asarray(changes, flat.dtype))
-    return response_of(flat), jax.lax.map(slope, directions)
-
-
-def _noise_array(noise: Any, traced: _TracedScene, plan: Plan) -> Float[Array, "wavelengths bins"]:
-    """Return the noise of each sample. **Raises:** ValueError for noise that is not above 0."""
-    lidar = traced.inputs.lidar
+    **Raises:** ValueError for noise that is not above 0, or of a shape that does not broadcast.
+    """
+    lidar, is_free = traced.inputs.lidar, traced.n_samples is not None
     if noise is None:
-        setup = traced.inputs.setup(traced.values)
-        reflectance = eqx.filter_jit(total_reflectance)(traced.response, setup)
+        response, _ = traced.at(lidar.divergence)
+        reflectance = eqx.filter_jit(TracedScene.record)(traced, lidar, response, traced.values)
         noise = _NOISE_FRACTION * float(jnp.max(reflectance))
+        if is_free:
+            return _white_noise(noise / math.sqrt(float(lidar.sampling_interval)))
     sigma = as_numpy(noise, "noise")
-    shape = (lidar.wavelength.size, plan.n_samples)
+    # Samples of a free interval have no fixed place in the record.
+    shape = (lidar.wavelength.size, 1 if is_free else plan.n_samples)
     try:
         sigma = np.broadcast_to(sigma, shape)
     except ValueError:
@@ -440,6 +525,18 @@ def _noise_array(noise: Any, traced: _TracedScene, plan: Plan) -> Float[Array, "
     if not np.all(sigma > 0):
         raise ValueError(f"noise = {np.min(sigma):g} is outside the admissible range (0, inf]")
     return jnp.asarray(sigma)
+
+
+def _white_noise(density: float) -> Callable[[Lidar, Array], Array]:
+    """Return noise that is white: its standard deviation grows with the root of the sampling interval.
+
+    `density`: standard deviation of a sample of 1 ns.
+    """
+
+    def noise(lidar: Lidar, reflectance: Array) -> Array:
+        return density * jnp.sqrt(lidar.sampling_interval) * jnp.ones_like(reflectance)
+
+    return noise
 
 
 def _relative_variance(width: Float[Array, " n"]) -> Cost:
@@ -453,7 +550,7 @@ def _relative_variance(width: Float[Array, " n"]) -> Cost:
 
 def _cramer_rao(
     lidar: Lidar,
-    traced: _TracedScene,
+    traced: TracedScene,
     noise: Any,
     names: tuple[str, ...],
     shapes: tuple[tuple[int, ...], ...],
@@ -465,17 +562,17 @@ def _cramer_rao(
     2. Rows of the whitened Jacobian, of the priors, and of a least precision, in widths of the bounds.
     3. R of their QR decomposition: R^T R is the information, R^-1 R^-T the bound.
     """
-    inputs = dataclasses.replace(traced.inputs, lidar=lidar)
     flat, restore = jax.flatten_util.ravel_pytree(traced.values)
+    response, slopes = traced.at(lidar.divergence)
 
     def waveform(response: Response, flat: Array) -> Array:
-        return total_reflectance(response, inputs.setup(restore(flat)))
+        return traced.record(lidar, response, restore(flat))
 
     def column(slope: Response, direction: Array) -> tuple[Array, Array]:
-        return jax.jvp(waveform, (traced.response, flat), (slope, direction))
+        return jax.jvp(waveform, (response, flat), (slope, direction))
 
     push = jax.vmap(column, out_axes=(None, 0))
-    reflectance, columns = push(traced.slopes, jnp.eye(flat.size, dtype=flat.dtype))
+    reflectance, columns = push(slopes, jnp.eye(flat.size, dtype=flat.dtype))
     sigma = noise(lidar, reflectance) if callable(noise) else noise
     whitened = columns / jnp.broadcast_to(jnp.asarray(sigma), reflectance.shape)[None]
     rows = whitened.reshape(flat.size, -1).T * traced.width[None]
@@ -487,10 +584,8 @@ def _cramer_rao(
     covariance = scaled_inverse @ scaled_inverse.T
     scaled_triangle = triangle / traced.width[None]
     std = jnp.sqrt(jnp.diag(covariance))
-    ends = np.cumsum([int(np.prod(shape)) for shape in shapes])
-    pieces = [std[end - int(np.prod(shape)) : end].reshape(shape) for end, shape in zip(ends, shapes)]
     return CramerRao(
-        stderr=dict(zip(names, pieces)),
+        stderr=dict(zip(names, split_values(std, shapes))),
         covariance=covariance,
         correlation=covariance / (std[:, None] * std[None]),
         information=scaled_triangle.T @ scaled_triangle,

@@ -39,25 +39,18 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Int, PRNGKeyArray, UInt32
 
 from inversion.fit.data import neighbour_correlation, shared_errors_of_samples
-from inversion.fit.model import ForwardModel, SimulationInputs, Values, batch_stderr, evaluate_scene
+from inversion.fit.model import ForwardModel, SimulationInputs, batch_stderr, evaluate_scene
 from inversion.fit.planning import checked_plan, trace_sizes
 from inversion.fit.prior_residuals import fixed_priors
 from inversion.fit.recorder_model import RecorderModel
 from inversion.fit.retrieval import checked_problem
 from inversion.fit.solver import DEFAULT_SOLVER
-from inversion.fit.unknowns import Unknown, flat_bounds, flat_labels, flat_start
+from inversion.fit.unknowns import Unknown, flat_bounds, flat_labels, flat_start, split_values
 from inversion.receiver.recorder import Recorder
 from jaxlidar import Lidar, Plan, Response, Scene, Waveform, total_reflectance
 from jaxlidar.extend import as_numpy, check_key, check_range, matmul, tensordot
 
 Shapes = tuple[tuple[int, ...], ...]
-
-
-def _split_values(flat: Array, shapes: Shapes) -> Values:
-    """Return the values of the unknowns, (..., *shape), from vectors (..., n)."""
-    ends = np.cumsum([int(np.prod(shape)) for shape in shapes])
-    pieces = jnp.split(flat, ends[:-1], axis=-1)
-    return tuple(piece.reshape(*flat.shape[:-1], *shape) for piece, shape in zip(pieces, shapes))
 
 
 class _Simulation(eqx.Module):
@@ -90,7 +83,7 @@ class _Simulation(eqx.Module):
 
 @eqx.filter_custom_jvp
 def _traced_reflectance(simulation: _Simulation, flat: Array) -> Float[Array, "wavelengths bins"]:
-    values = _split_values(flat, simulation.shapes)
+    values = split_values(flat, simulation.shapes)
     inputs = simulation.inputs_without_columns
     return evaluate_scene(inputs, values, simulation.keys, simulation.n_batches)[0]
 
@@ -100,7 +93,7 @@ def _(primals: Any, tangents: Any) -> tuple[Array, Array]:
     # One pass gives waveform and Jacobian, each column by its cheapest method. The tangent is linear in that
     # of the values, so that JAX transposes it: a gradient costs this pass as well.
     (simulation, flat), (_, flat_tangent) = primals, tangents
-    values = _split_values(flat, simulation.shapes)
+    values = split_values(flat, simulation.shapes)
     reflectance, columns, _ = evaluate_scene(simulation.inputs, values, simulation.keys, simulation.n_batches)
     if flat_tangent is None:
         return reflectance, jnp.zeros_like(reflectance)
@@ -218,7 +211,7 @@ class LogDensity(eqx.Module):
         **Raises:** ValueError for coordinates of another shape.
         """
         natural = self._natural(self._checked(x))
-        return dict(zip(self._unknown_names, _split_values(natural, self._shapes)))
+        return dict(zip(self._unknown_names, split_values(natural, self._shapes)))
 
     def to_unconstrained(self, values: Mapping[str, ArrayLike]) -> Float[Array, "... n"]:
         """Return unconstrained coordinates from values of all unknowns, such as those of a fit.
@@ -262,7 +255,7 @@ class LogDensity(eqx.Module):
         # Optics act on a response after it has been traced: one response serves all values of such unknowns.
         if self._response is None:
             return _traced_reflectance(self._simulation, scene_values)
-        values = _split_values(scene_values, self._simulation.shapes)
+        values = split_values(scene_values, self._simulation.shapes)
         return total_reflectance(self._response, self._simulation.inputs.setup(values))
 
     def _log_prior(self, scene_values: Array) -> Float[Array, ""]:

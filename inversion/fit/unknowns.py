@@ -373,14 +373,29 @@ def _locate_in_lidar(where: str, lidar: Lidar | None, name: str | None) -> tuple
     label = _label(name)
     if lidar is None:
         raise ValueError(f"{label}: where = {where!r}; admissible here are arrays of the scene")
-    leaves = jax.tree_util.tree_leaves_with_path(lidar)
-    paths = [_OF_LIDAR + jax.tree_util.keystr(path).lstrip(".") for path, _ in leaves]
-    admissible = [path for path in paths if _field_of_lidar(path) in (*_RAY_FIELDS, *_LATE_FIELDS)]
-    if where not in admissible:
-        raise ValueError(f"{label}: where = {where!r}; admissible are {', '.join(map(repr, admissible))}")
-    index = paths.index(where)
+    index, value = locate_lidar_array(
+        where, lidar, (*_RAY_FIELDS, *_LATE_FIELDS), argument=f"{label}: where", prefix=_OF_LIDAR
+    )
     # Positions are kept in double precision.
-    return index, where, as_array(leaves[index][1])
+    return index, where, as_array(value)
+
+
+def locate_lidar_array(
+    path: str, lidar: Lidar, fields: Sequence[str], *, argument: str, prefix: str = ""
+) -> tuple[int, Array | np.ndarray]:
+    """Return the index among the lidar's pytree leaves, and the value, of an array of one of some fields.
+
+    `argument`: that gave the path, for messages. `prefix`: with which paths begin.
+
+    **Raises:** ValueError for a path that is no such array, with those that are.
+    """
+    leaves = jax.tree_util.tree_leaves_with_path(lidar)
+    paths = [prefix + jax.tree_util.keystr(path).lstrip(".") for path, _ in leaves]
+    admissible = [p for p in paths if p.removeprefix(prefix).split(".")[0] in fields]
+    if path not in admissible:
+        raise ValueError(f"{argument} = {path!r}; admissible are {', '.join(map(repr, admissible))}")
+    index = paths.index(path)
+    return index, leaves[index][1]
 
 
 def _changed_arrays(u: Unknown, scene: Scene) -> frozenset[int]:
@@ -482,6 +497,13 @@ def flat_bounds(
     """Return the lower and upper bounds as two vectors."""
     low = np.concatenate([np.ravel(u.low) for u in unknowns])
     return low, np.concatenate([np.ravel(u.high) for u in unknowns])
+
+
+def split_values(flat: Array, shapes: tuple[tuple[int, ...], ...]) -> tuple[Array, ...]:
+    """Return the values of each shape, (..., *shape), from vectors (..., n). It takes tracers."""
+    ends = np.cumsum([int(np.prod(shape)) for shape in shapes])
+    pieces = jnp.split(flat, ends[:-1], axis=-1)
+    return tuple(piece.reshape(*flat.shape[:-1], *shape) for piece, shape in zip(pieces, shapes))
 
 
 def split_by_name(flat: np.ndarray, unknowns: Sequence[BoundUnknown]) -> dict[str, np.ndarray]:

@@ -109,8 +109,28 @@ def plan_scenes(
     for scene in examined:
         check_kinds(lidar, scene)
     effects = {**effects_of_family(examined), **({} if effects is None else effects)}
+    cases = [(lidar, scene) for scene in examined]
+    return plan_cases(cases, window=window, max_orders=max_orders, effects=effects, **options)
+
+
+def plan_cases(
+    cases: Sequence[tuple[Lidar, Scene]],
+    *,
+    window: tuple[float, float] | None,
+    max_orders: int | None,
+    effects: Mapping[str, bool],
+    **options: Any,
+) -> Plan:
+    """Make one plan that serves pairs of a lidar and a scene, each as it is.
+
+    Lidars have one sampling interval, and scenes one structure; other arguments are those of `plan_scenes`.
+
+    1. Plan every case by itself.
+    2. Plan every case with the common window, orders, width of fine bins and length of steps.
+    3. Take the union of these.
+    """
     common: dict[str, Any] = {**options, "effects": effects, "describe": False}
-    trials = [_plan_of(lidar, s, {**common, "window": window, "max_orders": max_orders}) for s in examined]
+    trials = [_plan_of(*case, {**common, "window": window, "max_orders": max_orders}) for case in cases]
     # A channel of a transmittance that is zero is harmless; one that is missing is not.
     first = max(range(len(trials)), key=lambda i: len(trials[i].config.channels))
     if window is None:
@@ -124,11 +144,11 @@ def plan_scenes(
         "histories": all(p.config.keeps_histories for p in trials),
         "bin_width": min(p.bins.width for p in trials),
     }
-    if examined[first].canopy is not None:
+    if cases[first][1].canopy is not None:
         common["max_step"] = max(p.limits.max_segment for p in trials)
     order = [first, *(i for i in range(len(trials)) if i != first)]
-    plans = [_plan_of(lidar, examined[i], common) for i in order]
-    united = union_plan([(lidar, examined[i]) for i in order], plans)
+    plans = [_plan_of(*cases[i], common) for i in order]
+    united = union_plan([cases[i] for i in order], plans)
     scope = united.scope._replace(
         first_return=min(p.scope.first_return for p in trials),
         last_return=max(p.scope.last_return for p in trials),

@@ -34,7 +34,12 @@ from jaxlidar.planning.setup import Setup
 from jaxlidar.planning.size_buckets import size_bucket
 from jaxlidar.scenes.atmosphere import Atmosphere
 from jaxlidar.spectral.pivot_wavelengths import PivotWavelengths, find_pivots
-from jaxlidar.spectral.pulse_convolution import PulseConvolution, pulse_convolution
+from jaxlidar.spectral.pulse_convolution import (
+    FreeSamplingConvolution,
+    PulseConvolution,
+    free_sampling_convolution,
+    pulse_convolution,
+)
 from jaxlidar.trace.histories import Histories, histories
 from jaxlidar.trace.response import Response
 
@@ -65,7 +70,7 @@ class WaveformModel(eqx.Module):
     """
 
     optics: Float[Array, "channels wavelengths"]
-    convolution: PulseConvolution
+    convolution: PulseConvolution | FreeSamplingConvolution
     time: Float[Array, "samples"]
     bin_start: Float[Array, ""]
     bin_width: Float[Array, ""]
@@ -176,7 +181,18 @@ def setup_optics(setup: Setup) -> Float[Array, "channels wavelengths"]:
 
 def make_waveform_model(setup: Setup, *, as_band: bool = False) -> WaveformModel:
     """Make the waveform model of a setup, with its sizes as they are; `as_band`: see `pulse_convolution`."""
-    return _make_model(setup, setup.plan.n_samples, setup.plan.degree, as_band=as_band)
+    plan = setup.plan
+    convolution = pulse_convolution(setup.lidar, plan, as_band=as_band)
+    return _make_model(setup, convolution, plan.sample_interval, plan.degree)
+
+
+def make_free_sampling_model(setup: Setup, n_samples: int) -> WaveformModel:
+    """Make the waveform model of a setup with the interval of its lidar's samples in place of the plan's.
+
+    It is differentiable with respect to the interval. The first sample is centred where that of the plan is.
+    """
+    convolution = free_sampling_convolution(setup.lidar, setup.plan, n_samples)
+    return _make_model(setup, convolution, setup.lidar.sampling_interval, setup.plan.degree)
 
 
 def make_padded_waveform_model(setup: Setup) -> WaveformModel:
@@ -187,19 +203,24 @@ def make_padded_waveform_model(setup: Setup) -> WaveformModel:
     plan, n_wavelengths = setup.plan, setup.lidar.wavelength.size
     if n_wavelengths > MAX_EXACT_WAVELENGTHS:
         return make_waveform_model(setup).padded_to(size_bucket(n_wavelengths, 16))
-    model = _make_model(setup, size_bucket(plan.n_samples, 1), plan.config.degree)
+    convolution = pulse_convolution(setup.lidar, plan, size_bucket(plan.n_samples, 1))
+    model = _make_model(setup, convolution, plan.sample_interval, plan.config.degree)
     return model.padded_to(max(size_bucket(n_wavelengths), MIN_WAVELENGTHS))
 
 
-def _make_model(setup: Setup, n_samples: int, degree: int, *, as_band: bool = False) -> WaveformModel:
-    """Make the waveform model of a setup.
+def _make_model(
+    setup: Setup,
+    convolution: PulseConvolution | FreeSamplingConvolution,
+    sample_interval: float | Float[Array, ""],
+    degree: int,
+) -> WaveformModel:
+    """Make the waveform model of a setup, for samples of a convolution.
 
-    1. The convolution with the pulse.
-    2. Where there is an atmosphere: its transmittance in fine bins, and its own return in samples.
-    3. The optics of all channels, and the degrees of histories: 0 where optics are applied by the tracer.
+    1. Where there is an atmosphere: its transmittance in fine bins, and its own return in samples.
+    2. The optics of all channels, and the degrees of histories: 0 where optics are applied by the tracer.
     """
     lidar, plan, atmosphere = setup.lidar, setup.plan, setup.scene.atmosphere
-    convolution, bins = pulse_convolution(lidar, plan, n_samples, as_band=as_band), plan.bins
+    bins = plan.bins
     bin_start, bin_width = (as_array(a) for a in (bins.start, bins.width))
     transmittance = air_return = air_relative_energy = None
     if atmosphere is not None:
@@ -217,7 +238,7 @@ def _make_model(setup: Setup, n_samples: int, degree: int, *, as_band: bool = Fa
     return WaveformModel(
         optics=setup_optics(setup),
         convolution=convolution,
-        time=as_array(plan.sample_start + plan.sample_interval * np.arange(n_samples)),
+        time=as_array(plan.sample_start + sample_interval * np.arange(convolution.n_samples)),
         bin_start=bin_start,
         bin_width=bin_width,
         transmittance=transmittance,

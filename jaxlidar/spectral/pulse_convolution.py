@@ -131,12 +131,65 @@ def _sample_fractions(
 ) -> Float[Array, "offsets"]:
     """Return the fractions of a return that samples receive, by offset from its fine bin."""
     cumulative = pulse.cumulative(edges, jitter)
-    in_bins = jnp.maximum(jnp.diff(cumulative), 0.0)
-    # The flux v/2 F'' across each edge, at most half of the smaller neighbour.
-    limit = 0.5 * jnp.minimum(in_bins[1:], in_bins[:-1])
-    flux = jnp.clip(0.5 * variance * jnp.diff(in_bins), -limit, limit)
-    cumulative = cumulative[1:-1] - flux
+    cumulative = _narrowed(cumulative[:-2], cumulative[1:-1], cumulative[2:], variance)
     return cumulative[bins_per_sample:] - cumulative[:-bins_per_sample]
 
 
+def _narrowed(
+    before: Float[Array, "..."], cumulative: Float[Array, "..."], after: Float[Array, "..."], variance: float
+) -> Float[Array, "..."]:
+    """Return the integral of the pulse without the spread of the kernel that made deposits, F - v/2 F''.
+
+    `before`, `after`: the integral one fine bin earlier and later. `variance`: of the kernel, in bins.
+    """
+    earlier_bin = jnp.maximum(cumulative - before, 0.0)
+    later_bin = jnp.maximum(after - cumulative, 0.0)
+    # The flux v/2 F'' across each edge, at most half of the smaller neighbour.
+    limit = 0.5 * jnp.minimum(later_bin, earlier_bin)
+    flux = jnp.clip(0.5 * variance * (later_bin - earlier_bin), -limit, limit)
+    return cumulative - flux
+
+
 _compiled_fractions = Program(_sample_fractions)
+
+
+@final
+class FreeSamplingConvolution(eqx.Module):
+    """The map of `PulseConvolution` for samples of any interval, differentiable with respect to that.
+
+    Made by `free_sampling_convolution`. Its samples need not begin or end where fine bins do.
+
+    - `weights`: fraction of a return in each fine bin that each sample receives.
+    """
+
+    weights: Float[Array, "fine samples"]
+
+    @property
+    def n_bins(self) -> int:
+        """Number of fine bins."""
+        return self.weights.shape[0]
+
+    @property
+    def n_samples(self) -> int:
+        """Number of samples."""
+        return self.weights.shape[1]
+
+    def __call__(self, fine: Float[Array, "*s bins"]) -> Float[Array, "*s samples"]:
+        """Return the samples of returns in fine bins."""
+        return einsum("...b,bs->...s", fine, self.weights)
+
+
+def free_sampling_convolution(lidar: Lidar, plan: Plan, n_samples: int) -> FreeSamplingConvolution:
+    """Make the convolution of a lidar's pulse with samples of its own interval, not of the plan's.
+
+    The first sample is centred where that of the plan is, and each begins where the one before it ends.
+    """
+    bins, sample_start = plan.bins, plan.sample_start
+    bin_time = as_array(bins.start + bins.width * np.arange(bins.count) - sample_start)
+    edges = lidar.sampling_interval * as_array(np.arange(n_samples + 1) - 0.5)
+    offset = edges[None, :] - bin_time[:, None]
+    before, cumulative, after = (
+        lidar.pulse.cumulative(offset + shift, lidar.jitter) for shift in (-bins.width, 0.0, bins.width)
+    )
+    narrowed = _narrowed(before, cumulative, after, KERNEL_VARIANCE)
+    return FreeSamplingConvolution(jnp.diff(narrowed, axis=1))
