@@ -98,8 +98,8 @@ def main() -> None:
     for draw in (scenes, paper, minnaert):
         with atomic_write(GALLERY / f"{draw.__name__}.png") as draft:
             draw().savefig(draft, dpi=80, format="png")
-    runpy.run_path(str(EXAMPLES / "bimodal.py"))["main"](["--out", str(GALLERY)])
-    runpy.run_path(str(EXAMPLES / "street.py"))["main"](["--out", str(GALLERY)])
+    for script in ("bimodal", "spectrum_and_waveform", "street"):
+        runpy.run_path(str(EXAMPLES / f"{script}.py"))["main"](["--out", str(GALLERY)])
     _reduce_colours(GALLERY / "street.png")
 
 
