@@ -98,22 +98,21 @@ def register_beam(mi, task) -> None:
 
 
 def instrument(mi, task, camera: bool = False) -> dict:
-    """Return sensor and light.
+    """Return sensor and light. A task without a count of bins of time has a film without.
 
     A Lambertian target of reflectance rho that fills the footprint has the radiance rho.
     """
     position, _ = axes_of_beam(task)
     distance, radius = float(np.linalg.norm(position)), float(task["radius"])
-    start, width, count = (float(task[n]) for n in ("start", "fine", "count"))
-    film = {
-        "type": "transient_hdr_film",
-        "width": 1,
-        "height": 1,
-        "temporal_bins": int(count),
-        "start_opl": 2 * distance + start * SPEED_OF_LIGHT,
-        "bin_width_opl": width * SPEED_OF_LIGHT,
-        "rfilter": {"type": "box"},
-    }
+    film = {"type": "hdrfilm", "width": 1, "height": 1, "rfilter": {"type": "box"}}
+    if "count" in task:
+        start, width, count = (float(task[n]) for n in ("start", "fine", "count"))
+        film |= {
+            "type": "transient_hdr_film",
+            "temporal_bins": int(count),
+            "start_opl": 2 * distance + start * SPEED_OF_LIGHT,
+            "bin_width_opl": width * SPEED_OF_LIGHT,
+        }
     sampler = {"type": "independent"}
     power = np.pi * distance**2
     if not camera:

@@ -104,6 +104,35 @@ def peers(record: dict) -> str:
     )
 
 
+def peers_gradient(record: dict) -> str:
+    rows = [
+        [
+            r["code"],
+            number(r["seconds"]),
+            number(100 * r["error"]),
+            number(r["seconds_to_10_percent"]),
+            number(r["cpu_seconds_to_10_percent"]),
+            number(r.get("cpu_ratio")),
+            number(r["cpu_times_one_simulation"]),
+            number(r["first_call_seconds"]),
+        ]
+        for r in record["results"]
+    ]
+    peers = [r for r in record["results"] if "z" in r]
+    difference = max((abs(v) for r in peers for v in r["relative_difference"].values()), default=0.0)
+    z = max((abs(v) for r in peers for v in r["z"].values()), default=0.0)
+    load = max(record["machine"]["load_before"].values())
+    head = ["code", "s", "error %", "s to 10 %", "CPU s to 10 %", "times jaxlidar, CPU"]
+    return page_of(
+        "The gradient of all light that a crown of 64³ voxels returns, by the extinction of each, beside "
+        "Mitsuba's path replay without time (`prbvolpath`). The error is that of single voxels, of which "
+        f"each has few paths; sums over voxels differ by at most {number(100 * difference)} %, "
+        f"{number(z)} standard errors. Other programs ran at the same time (load {number(load)}): compare "
+        "seconds of the CPU.",
+        table([*head, "CPU, times one simulation", "s, first call"], rows),
+    )
+
+
 def simulation(record: dict) -> str:
     rows = [
         [
@@ -649,6 +678,7 @@ SECTIONS: dict[str, tuple[str, Callable[[dict], str]]] = {
     "surveys": ("Cost of thousands of footprints", surveys),
     "narrow_shots": ("Cost of narrow shots", narrow_shots),
     "peers": ("Other codes", peers),
+    "peers_gradient": ("A gradient beside another code", peers_gradient),
     "effects_cost": ("Time saved by plans", effects),
     "scaling": ("Scaling of cost", scaling),
     "meshes": ("Cost of meshes", meshes),
