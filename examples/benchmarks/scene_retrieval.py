@@ -224,7 +224,7 @@ def terrain_track(shots: int) -> dict:
         "canopy.voxels.leaf", bounds=(0.0, 2.0), name="leaf", prior=inversion.MarkovField(0.1)
     )
     nodes = inversion.Unknown(
-        "ground.heights", bounds=(0.0, 12.0), name="heights", prior=inversion.MarkovField(1.0)
+        "ground.heights", bounds=(0.0, 12.0), name="heights", prior=inversion.MarkovField(0.5)
     )
     fit, row = retrieve(records, survey, start, [leaf, nodes], n_rays=128)
     inner = slice(shots // 20, -shots // 20)

@@ -282,8 +282,8 @@ def _shot_results(
 
     `error_factor`: standard error over that of batches that are independent.
     """
-    stderr = jax.tree.map(lambda a: error_factor * a, estimate.stderr)
-    errors = ShotErrors(*stderr, error_factor * _relative_error(estimate))
+    waveform_stderr, energy_budget_stderr = jax.tree.map(lambda a: error_factor * a, estimate.stderr)
+    errors = ShotErrors(waveform_stderr, energy_budget_stderr, error_factor * _relative_error(estimate))
     mean: ShotBatch = estimate.mean_only
     photons = estimate.count * aimed.setup.plan.photons_traced
     return make_shot_results(aimed.model, *mean, errors, photons=photons, kept_names=kept_names)

@@ -250,8 +250,8 @@ def test_errors_of_the_top_hold_and_those_of_the_fit_alone_do_not(example, tmp_p
             for row in rows
         ]
     )
-    own = np.sqrt(np.maximum(stderr**2 - added**2, 0.0))
-    assert np.mean(np.abs(error) <= 2.0 * own) < 0.7
+    linear_error = np.sqrt(np.maximum(stderr**2 - added**2, 0.0))
+    assert np.mean(np.abs(error) <= 2.0 * linear_error) < 0.7
 
 
 def test_the_highest_return_is_that_of_the_first_plants(example, tmp_path):

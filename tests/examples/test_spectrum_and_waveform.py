@@ -45,13 +45,13 @@ def test_both_records_tell_more_than_either_and_errors_are_those_of_noise(tmp_pa
     assert (tmp_path / "spectrum_and_waveform.png").read_bytes().startswith(b"\x89PNG")
     results, module = np.load(tmp_path / "results.npz"), load()
     names = list(module.UNKNOWNS)
-    spectrum, waveform, both = (dict(zip(names, results[k])) for k in ("spectrum", "waveform", "both"))
+    spectrum, waveform, joint = (dict(zip(names, results[k])) for k in ("spectrum", "waveform", "both"))
     # The waveform knows no chlorophyll beyond its prior, and leaf area better than the spectrum.
     assert waveform["chlorophyll"] > 0.98 * module.UNKNOWNS["chlorophyll"].prior[1]
     assert waveform["leaf area index"] < 0.7 * spectrum["leaf area index"]
     # Leaf structure and soil, which the waveform tells, are what makes chlorophyll of the spectrum uncertain.
-    assert both["chlorophyll"] < 0.8 * spectrum["chlorophyll"]
-    assert both["leaf area index"] < waveform["leaf area index"]
+    assert joint["chlorophyll"] < 0.8 * spectrum["chlorophyll"]
+    assert joint["leaf area index"] < waveform["leaf area index"]
 
     # Stated errors are those of repeated noise; another chlorophyll, 10 µg/cm² away, is rejected.
     pair = [names.index("leaf area index"), names.index("chlorophyll")]
