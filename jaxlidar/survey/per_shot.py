@@ -74,6 +74,8 @@ from jaxlidar.trace.response import Response, footprint_shift, trace_device_scen
 
 # Largest number of shots of a chunk, of first order alone and of more: a chunk cannot be interrupted.
 _CHUNK_FIRST_ORDER, _CHUNK_HIGHER_ORDERS = 128, 16
+# The same of narrow shots, which take so little time that what a chunk costs by itself counts.
+_CHUNK_NARROW = 512
 # Largest number of batches of a shot, or of parts of a lattice: a tolerance that is out of reach ends here.
 MAX_BATCHES_OR_PARTS = 1024
 # Rays that are marched side by side: more would not fit into a processor's cache.
@@ -163,7 +165,8 @@ class PerShotStrategy(AbstractStrategy):
         It depends on the survey and the plan alone, not on the number of workers.
         """
         shots = len(self.survey)
-        largest = _CHUNK_HIGHER_ORDERS if self.setup.plan.orders > 1 else _CHUNK_FIRST_ORDER
+        largest = _CHUNK_NARROW if self.resolves_edges else _CHUNK_FIRST_ORDER
+        largest = _CHUNK_HIGHER_ORDERS if self.setup.plan.orders > 1 else largest
         largest = min(largest, max(1, shots // 8))
         # Chunks of nearly equal size: the copies that fill up the last one are traced in vain.
         return -(-shots // -(-shots // largest))

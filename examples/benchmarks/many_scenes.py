@@ -1,0 +1,74 @@
+"""Cost of a scene among many: stands of random density, height and ground reflectance, by `simulate_scenes`.
+
+Run it as `python examples/benchmarks/many_scenes.py [--out figures] [--scenes 10000]`. The stands and the
+lidar are those of the section on many scenes in `jaxlidar/README.md`. A tenth of the scenes is followed
+through all orders, with several numbers of photons in each of eight batches.
+"""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from _common import machine, new_figure, options, print_table, save_figure, seconds, write_json
+
+import jaxlidar as jl
+
+PHOTONS, MAX_ORDERS = (32, 128, 512), 8
+LIDAR = jl.Lidar(altitude=4e5, divergence=0.0625, aperture=0.8, pulse=jl.GaussianPulse(15.6))
+
+
+def stand(density: jax.Array, base: jax.Array, reflectance: jax.Array) -> jl.Scene:
+    voxels = jl.VoxelMap.from_lad(
+        density, voxel_size=(60.0, 60.0, 2.0), origin=jnp.stack([-30.0, -30.0, base])
+    )
+    canopy = jl.Canopy(voxels, leaf=jl.LeafOptics(0.45, 0.4), sides="periodic")
+    return jl.Scene(canopy=canopy, ground=jl.Ground(reflectance=reflectance))
+
+
+def stands(count: int) -> jl.Scene:
+    """Return a stack of so many random stands."""
+    keys = jax.random.split(jax.random.key(0), 2)
+    densities = jax.random.uniform(keys[0], (count, 1, 1, 12), maxval=0.3)
+    bases, reflectances = jax.random.uniform(keys[1], (2, count), minval=0.1, maxval=0.4)
+    return jax.vmap(stand)(densities, bases, reflectances)
+
+
+def cost(scenes: jl.Scene, **settings) -> dict[str, object]:
+    """Return the time of a scene, compiled before, and the median error of a scene."""
+    plan = jl.plan_scenes(LIDAR, scenes, n_rays=8, footprint="fixed", **settings)
+
+    def simulate() -> jl.SceneWaveforms:
+        return jl.simulate_scenes(LIDAR, scenes, plan=plan, key=jax.random.key(1))
+
+    waves = simulate()
+    elapsed = min(seconds(lambda: simulate().reflectance) for _ in range(3))
+    total, count = np.asarray(waves.reflectance).sum(axis=-1), len(waves.reflectance)
+    # Errors of samples are those of their own light; the root of their sum of squares is that of the sum if
+    # they are independent, as first photons of a batch nearly are.
+    error = np.sqrt((np.asarray(waves.stderr) ** 2).sum(axis=-1)) / total
+    return {"scenes": count, "ms per scene": 1e3 * elapsed / count, "error, median": float(np.median(error))}
+
+
+def main() -> None:
+    arguments = options("Cost of many scenes.", scenes=10_000)
+    rows = [{"orders": 1, "photons": 0, **cost(stands(arguments.scenes), max_orders=1)}]
+    for photons in PHOTONS:
+        settings = {"max_orders": MAX_ORDERS, "n_photons": photons}
+        rows.append(
+            {
+                "orders": MAX_ORDERS,
+                "photons": 8 * photons,
+                **cost(stands(max(arguments.scenes // 10, 1)), **settings),
+            }
+        )
+    write_json(arguments.out / "many_scenes.json", {"machine": machine(), "rows": rows})
+    figure, axes = new_figure()
+    axes.loglog([r["ms per scene"] for r in rows[1:]], [100 * r["error, median"] for r in rows[1:]], "o-")
+    axes.axvline(rows[0]["ms per scene"], color="0.5", ls="--", label="first order")
+    axes.set(xlabel="ms per scene", ylabel="error of the whole waveform, median, %", title="eight orders")
+    axes.legend()
+    save_figure(figure, arguments.out / "many_scenes.png")
+    print_table(tuple(rows[0]), [tuple(r.values()) for r in rows])
+
+
+if __name__ == "__main__":
+    main()
