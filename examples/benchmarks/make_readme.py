@@ -671,12 +671,34 @@ def narrow_shots(record: dict) -> str:
     )
 
 
+def many_scenes(record: dict) -> str:
+    return page_of(
+        "Stands of 12 layers over level ground, of random density, height and reflectance, by `plan_scenes` "
+        "and `simulate_scenes`, compiled before. At first order nothing is random. The error is that of the "
+        "sum of a waveform, in the median over scenes.",
+        table(
+            ("orders", "photons a scene", "scenes", "ms a scene", "error, median"),
+            [
+                (
+                    str(r["orders"]),
+                    str(r["photons"]),
+                    f"{r['scenes']:,}",
+                    number(r["ms per scene"]),
+                    f"{number(100 * r['error, median'])} %",
+                )
+                for r in record["rows"]
+            ],
+        ),
+    )
+
+
 SECTIONS: dict[str, tuple[str, Callable[[dict], str]]] = {
     "accuracy_cost": ("Cost of accuracy", accuracy),
     "simulation_cost": ("Cost of `simulate`", simulation),
     "everyday_changes": ("Cost of changing a scene", changes),
     "surveys": ("Cost of thousands of footprints", surveys),
     "narrow_shots": ("Cost of narrow shots", narrow_shots),
+    "many_scenes": ("Cost of a scene among many", many_scenes),
     "peers": ("Other codes", peers),
     "peers_gradient": ("A gradient beside another code", peers_gradient),
     "effects_cost": ("Time saved by plans", effects),
