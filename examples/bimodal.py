@@ -161,6 +161,8 @@ def sample_tempered(
             # A tempered mode is wider.
             widening = min(max(float(state.tempering_param), 1e-4) ** -0.5, 20.0)
             state, _ = kernel(step_key, state, 10, {"lengths": jnp.asarray(widening * scale)[None]})
+        if float(state.tempering_param) < 1.0:
+            raise RuntimeError(f"tempering has not come to its end in {len(keys)} steps")
         samples.append(np.asarray(problem.density.to_natural(state.particles)["ground"]))
     return np.stack(samples)
 

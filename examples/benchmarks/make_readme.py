@@ -587,6 +587,7 @@ def devices(record: dict) -> str:
 
 def scene_retrieval(record: dict) -> str:
     rows, narrow, terrain = record["footprints"], record["narrow"], record["terrain"]
+    medians = {k: statistics.median(map(abs, terrain[f"error {k}"])) for k in ("alone", "together")}
     leaves = [
         [
             r["stand"],
@@ -628,7 +629,8 @@ def scene_retrieval(record: dict) -> str:
         f"leaves of unknown density. The rms error of the ground's height is {terrain['rms alone']:.2f} m "
         f"where each footprint is fitted alone, over a slope of its own, and {terrain['rms together']:.2f} m "
         "where nodes of the terrain and voxels of leaves are fitted to all records together, from there on; "
-        f"{number(terrain['cpu seconds'])} CPU seconds.",
+        f"the median sizes of the error are {medians['alone']:.2f} and {medians['together']:.2f} m: single "
+        f"fits that end at another echo make the difference. {number(terrain['cpu seconds'])} CPU seconds.",
     )
 
 
@@ -666,25 +668,25 @@ def narrow_shots(record: dict) -> str:
         f"the peak detector written as LAZ: {number(flight['seconds'])} s, "
         f"{number(sum(flight[f'us per shot, {s}'] for s in stages))} µs a shot ("
         + ", ".join(f"{s} {number(flight[f'us per shot, {s}'])}" for s in stages)
-        + f"), {number(flight['points'], 4)} points of {number(flight['bytes per point'])} bytes, at most "
+        + f"), {flight['points']:,} points of {number(flight['bytes per point'])} bytes, at most "
         f"{number(flight['peak GB'])} GB.",
     )
 
 
 def many_scenes(record: dict) -> str:
     return page_of(
-        "Stands of 12 layers over level ground, of random density, height and reflectance, by `plan_scenes` "
+        "Stands of 12 layers over level ground, of random density and ground reflectance, by `plan_scenes` "
         "and `simulate_scenes`, compiled before. At first order nothing is random. The error is that of the "
-        "sum of a waveform, in the median over scenes.",
+        "sum of a waveform, in the root mean square over scenes.",
         table(
-            ("orders", "photons a scene", "scenes", "ms a scene", "error, median"),
+            ("orders", "photons a scene", "scenes", "ms a scene", "error"),
             [
                 (
                     str(r["orders"]),
                     str(r["photons"]),
                     f"{r['scenes']:,}",
                     number(r["ms per scene"]),
-                    f"{number(100 * r['error, median'])} %",
+                    f"{number(100 * r['error'])} %",
                 )
                 for r in record["rows"]
             ],

@@ -26,10 +26,11 @@ from surveys import forest, scan
 
 import jaxlidar as jl
 from jaxlidar import SPEED_OF_LIGHT
+from jaxlidar.planning.plan import MIN_BATCHES
+from jaxlidar.survey.per_shot import _LEAST_PARTS_TIMES_RTOL, _RAYS_OF_PART
 
 SIDE, SHOTS, SHOTS_OF_LINE, ROUNDS = 120, 5000, 20_000, 5
-# Rays of a shot in the first round, by tolerance (`jaxlidar.survey.per_shot`).
-FIRST_RAYS = {0.05: 64, 0.02: 128}
+TOLERANCES = (0.05, 0.02)
 f4 = np.float32
 LIGHT = f4(SPEED_OF_LIGHT)
 
@@ -153,7 +154,9 @@ def simulate(survey: jl.Survey, scene: jl.Scene, rtol: float, seed: int = 1, **s
 def by_tolerance(scene: jl.Scene) -> list[dict]:
     """Return the cost of a shot of 5,000, and that of the kernel with as many rays as the first round has."""
     survey, rows = scan(SIDE, SHOTS), []
-    for rtol, rays in FIRST_RAYS.items():
+    for rtol in TOLERANCES:
+        # Those of a shot in the first round.
+        rays = _RAYS_OF_PART * MIN_BATCHES * math.ceil(_LEAST_PARTS_TIMES_RTOL / rtol)
         run = kernel(survey, scene, jl.plan(survey, scene, rtol=rtol, max_orders=1, describe=False))
         waves = simulate(survey, scene, rtol)
         # The kernel does the same work: it returns the same energy, in the mean over shots.

@@ -1,4 +1,4 @@
-r"""Design of an instrument: the wavelengths, pulse and energies that minimise Cramer-Rao bounds.
+r"""Design of an instrument: the wavelengths, pulse, energies, divergence and sampling of least error.
 
 For a lidar d and the unknowns x of a scene, J(d) = dw / dx are the derivatives of its waveform, sigma(d) the
 noise and P the precision of the priors. The Cramer-Rao bound is the inverse of
@@ -8,8 +8,9 @@ noise and P the precision of the priors. The Cramer-Rao bound is the inverse of
 A cost of the bound, such as the sum of the relative variances (A-optimality), is minimised over d by its
 gradient, which holds mixed second derivatives of the waveform by unknowns and design.
 
-Light is traced once for each scene. The response R and its derivatives by the unknowns do not depend on what
-acts after the trace: wavelengths, pulse, energies, jitter and sampling. So for every design,
+Without a free divergence, light is traced once for each scene. The response R and its derivatives by the
+unknowns do not depend on what acts after the trace: wavelengths, pulse, energies, jitter and sampling. So for
+every design,
 
     J(d) = dw / dR . dR / dx + dw / dx at constant R,   w = w(R, x, d),
 
@@ -64,10 +65,15 @@ from jaxlidar.planning.scene_family import plan_cases
 # Fields of a lidar that can be free: those that act after the trace, of which `inversion.fit.unknowns` names
 # those that records determine, and the divergence, which is interpolated.
 _ADMISSIBLE_FIELDS = (
-    *("wavelength", "pulse", "energy", "efficiency", "jitter", "sampling_interval"),
+    "wavelength",
+    "pulse",
+    "energy",
+    "efficiency",
+    "jitter",
+    "sampling_interval",
     "divergence",
 )
-# Those of which a value of zero, or its logarithm, is not admissible.
+# Fields whose limits must be above zero.
 _POSITIVE_FIELDS = ("sampling_interval", "divergence")
 # Bounds of wavelengths, nm: those of the leaf models. Of other values: this factor about those of the lidar.
 _WAVELENGTHS, _DEFAULT_FACTOR = (400.0, 2500.0), 4.0
@@ -77,10 +83,10 @@ _NOISE_FRACTION = 0.01
 _LEAST_PRECISION = 1e-6
 # Divergences of the first traces, and the most.
 _FIRST_NODES, _MAX_NODES = 9, 33
-# Relative errors of the cost between divergences down to which there are more of them: over all limits, where
-# the minima have to be told apart, and within a factor of the best one.
+# Divergences are added until the interpolated cost has this relative error: over all limits, where the minima
+# have to be told apart, and within the factor `_NEAR_BEST` of the best divergence.
 _COARSE_TOLERANCE, _FINE_TOLERANCE, _NEAR_BEST = 0.1, 0.01, 1.5
-# The error counts up to so many times the lowest cost.
+# Errors count only where the cost is below this multiple of the lowest one.
 _NEAR_LOWEST = 4.0
 # Cost of a design that is not finite, such as one of two equal wavelengths; of its logarithm.
 _REJECTED_COST = 1e6
@@ -97,7 +103,8 @@ class Design(eqx.Module):
     - `values`: its free values, by path, in their own units.
     - `cost`, `initial_cost`: of this lidar, and of the one that was given.
     - `bounds`: a `CramerRao` of each scene, by this lidar.
-    - `costs`: (starts,) cost at the minimum that each start has reached.
+    - `costs`: (starts,) cost at the minimum that each start has reached. With a free divergence these are
+      interpolated, before the search is refined about the best of them.
     - `converged`: True if the best start has met the tolerance of the optimiser.
 
     **Example:**
@@ -177,11 +184,11 @@ def design(
 
     The cost of the Cramer-Rao bounds, its mean over the scenes, is minimised by its gradient. Light is
     traced once for each scene, so that a step takes milliseconds. With a free divergence it is traced at
-    nine divergences within the limits or more, until the cost between them is known to 1 %.
+    17 to 33 divergences within the limits, and again near the best one, until the cost between them is known
+    to 1 %.
 
-    Where footprints or shots lie is no value of a lidar, and their number no smooth one. Compare spacings by
-    a list of them: records of separate shots add to the information, `CramerRao.information`, of
-    `cramer_rao` with a lidar at each position.
+    The positions and the number of shots cannot be free. To choose them, compare a list: records of separate
+    shots add to the information, `CramerRao.information`, of `cramer_rao` with a lidar at each position.
 
     **Arguments:**
 
@@ -395,9 +402,10 @@ def _refined(
             for scenes in (traced_scenes, refined)
         )
         # Not finite where no record determines an unknown: no design has such a divergence.
-        lowest = np.minimum(interpolated, exact)
+        lowest = np.fmin(interpolated, exact)
         is_near = lowest < _NEAR_LOWEST * np.min(exact[np.isfinite(exact)], initial=np.inf)
         errors = np.abs(interpolated[is_near] / exact[is_near] - 1.0)
+        errors = np.where(np.isfinite(errors), errors, np.inf)
         error = float(np.max(errors, initial=0.0))
         traced_scenes = refined
         if error < tolerance:

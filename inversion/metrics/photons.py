@@ -152,11 +152,11 @@ def photon_ground_and_canopy(
     The method uses neither pulse nor dead time: where echoes are strong, both heights have the bias of first
     photons. The few photons of a thin top are lost with the noise, so canopies read low by a metre or so
     under sunlight. Light is taken to travel straight down. Under a canopy that lets hardly any photon reach
-    the ground, the ground is the lower edge of what returns, often but not always "doubtful". Where no
-    surface is certain, a ground is good if background alone would hardly give as many photons anywhere in the
-    window, and else "doubtful". On slopes of more
-    than 6 degrees the echo of bare ground is wider than this model has it: with several photons in a pulse
-    its upper half passes for low plants, over a ground that is a metre low or more, and both are "doubtful".
+    the ground, the ground is the lower edge of what returns, and may be "good" all the same. Where no
+    surface is certain, a ground is "good" if background alone would hardly give as many photons anywhere in
+    the window. On slopes of more than 6 degrees the echo of bare ground is wider than this model has it: with
+    several photons in a pulse its upper half passes for low plants, over a ground that is a metre low or
+    more, and both are "doubtful".
 
     **Arguments:**
 
@@ -231,8 +231,8 @@ def photon_ground_and_canopy(
     near = np.bincount(number[is_near], minlength=n_segments)
     by_background = expected * lengths * 2.0 * _GROUND_RANGE
     fewest = np.maximum(stats.poisson.isf(_FALSE_GROUND, by_background) + 1.0, _DOUBTFUL_PHOTONS)
-    # A good one, unless the dense surface is certain: more than the background gives at any of the places in
-    # the window. A certain surface has more photons than background alone gives to any such slab.
+    # Good ground: where the dense surface has more photons than background gives any slab of the window, the
+    # test for one place is enough. Elsewhere the count must be rare over all places.
     slab, window = _SLAB * _SURFACE_STEP, float(np.ptp(photons.window))
     at_surface = np.abs(photons.z - surface.height_at(photons.x)) <= 0.5 * slab
     surface_count = np.bincount(number[at_surface], minlength=n_segments)
@@ -609,7 +609,7 @@ def _posterior(evidence: np.ndarray, offsets: np.ndarray) -> np.ndarray:
 
 
 def _rare_count(expected: np.ndarray, places: np.ndarray | float) -> np.ndarray:
-    """Return the fewest events that background alone hardly gives at any of so many places."""
+    """Return the smallest count that background reaches at any of so many places only by `_FALSE_GOOD`."""
     probability = np.minimum(_FALSE_GOOD / np.maximum(places, 1.0), 1.0)
     return stats.poisson.isf(probability, expected) + 1.0
 

@@ -58,8 +58,24 @@ def response_bytes(config: TraceConfig, bins: TimeBins, *, degree: int, n_traces
     return float(_number_bytes() * n_traces * n_materials * (higher + first) * bins.padded)
 
 
+def band_size(width: int, bins_per_sample: int) -> int:
+    """Return the number of elements of the matrices of a band of so many fine bins.
+
+    See `jaxlidar.spectral.pulse_convolution`: two blocks of fine bins by the samples of a tile.
+    """
+    n_tile = -(-width // bins_per_sample)
+    return 2 * n_tile**2 * bins_per_sample
+
+
 def simulation_bytes(
-    config: TraceConfig, bins: TimeBins, *, degree: int, n_samples: int, pulse_bins: int, n_traces: int
+    config: TraceConfig,
+    bins: TimeBins,
+    *,
+    degree: int,
+    n_samples: int,
+    bins_per_sample: int,
+    pulse_bins: int,
+    n_traces: int,
 ) -> float:
     """Return the bytes of all responses that are alive at once, of the pulse, and of compiling.
 
@@ -67,14 +83,17 @@ def simulation_bytes(
 
     - `config`, `bins`: of a plan.
     - `degree`: largest number of scatterings in a history.
-    - `n_samples`: samples of the waveform.
+    - `n_samples`, `bins_per_sample`: samples of the waveform, and fine bins in each.
     - `pulse_bins`: fine bins that the pulse spans.
     - `n_traces`: traces of a response; one for each wavelength where leaves transmit straight on, or where
       optics are applied while light is traced.
     """
     response = response_bytes(config, bins, degree=degree, n_traces=n_traces)
-    # A matrix has at most `MAX_DENSE_PULSE` elements, a band `pulse_bins`: this is an upper bound for both.
-    pulse = _number_bytes() * min(bins.count * n_samples, max(MAX_DENSE_PULSE, pulse_bins))
+    # Applied as a matrix, or as a band where that is larger than `MAX_DENSE_PULSE` and than the band.
+    n_elements = bins.count * n_samples
+    if n_elements > MAX_DENSE_PULSE:
+        n_elements = min(n_elements, band_size(pulse_bins, bins_per_sample))
+    pulse = _number_bytes() * n_elements
     return response * (_RESPONSE_COPIES * (os.cpu_count() or 1) + 1) + 2 * pulse + _COMPILATION
 
 

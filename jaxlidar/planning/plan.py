@@ -441,6 +441,7 @@ def plan(
             bins,
             degree=degree_of(orders, keeps),
             n_samples=samples.count,
+            bins_per_sample=samples.bins_per_sample,
             pulse_bins=pulse_bins,
             n_traces=n_traces(keeps),
         ) + mesh_bytes(scene.meshes)

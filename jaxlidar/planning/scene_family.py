@@ -123,12 +123,15 @@ def plan_cases(
 ) -> Plan:
     """Make one plan that serves pairs of a lidar and a scene, each as it is.
 
-    Lidars have one sampling interval, and scenes one structure; other arguments are those of `plan_scenes`.
+    Lidars have one sampling interval; other arguments are those of `plan_scenes`.
+
+    **Raises:** ValueError for scenes of different structure.
 
     1. Plan every case by itself.
     2. Plan every case with the common window, orders, width of fine bins and length of steps.
     3. Take the union of these.
     """
+    _check_one_structure([scene for _, scene in cases])
     common: dict[str, Any] = {**options, "effects": effects, "describe": False}
     trials = [_plan_of(*case, {**common, "window": window, "max_orders": max_orders}) for case in cases]
     # A channel of a transmittance that is zero is harmless; one that is missing is not.
@@ -172,11 +175,15 @@ def _checked_sequence(scenes: Any) -> list[Scene]:
         raise ValueError("scenes is empty; admissible is one scene or more")
     for i, scene in enumerate(scenes):
         check_kind(f"scenes[{i}]", scene, Scene, "a Scene")
+    return list(scenes)
+
+
+def _check_one_structure(scenes: Sequence[Scene]) -> None:
+    for i, scene in enumerate(scenes):
         if jax.tree.structure(scene) != jax.tree.structure(scenes[0]):
             raise ValueError(
                 f"scenes[{i}] and scenes[0] differ in their structure; admissible is one structure"
             )
-    return list(scenes)
 
 
 def stack_size(scenes: Scene) -> int:

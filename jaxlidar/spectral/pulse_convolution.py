@@ -4,7 +4,7 @@ A return in the fine bin at t_i adds to the sample at t_s, of the width D, the f
 
     F(t_s - t_i + D/2) - F(t_s - t_i - D/2),   F(t) = integral of the pulse's power up to t,
 
-which depends on t_s - t_i alone. It is applied as a matrix of fine bins and samples where that is small, else
+which depends on t_s - t_i alone. It is applied as a matrix of fine bins and samples where that is small, or
 as a band: samples in tiles, each of which takes from two blocks of fine bins, by one matrix for all tiles.
 
 Deposits were spread by a kernel (`jaxlidar.trace.deposit`) of the second moment v = 1/4 bin^2
@@ -28,7 +28,7 @@ from jaxlidar._programs import Program
 from jaxlidar.instrument.lidar import Lidar
 from jaxlidar.instrument.pulse import AbstractPulse
 from jaxlidar.planning.config import KERNEL_VARIANCE
-from jaxlidar.planning.memory import MAX_DENSE_PULSE
+from jaxlidar.planning.memory import MAX_DENSE_PULSE, band_size
 from jaxlidar.planning.plan import Plan
 
 
@@ -89,9 +89,9 @@ class PulseConvolution(eqx.Module):
         """Return the fraction of each bin of the two blocks of a tile that each of its samples receives."""
         block, width = n_tile * self.bins_per_sample, self.fractions.size
         bins = np.arange(block)[:, None, None] + block * np.arange(2)[None, :, None]
-        number = np.arange(n_tile)[None, None, :] * self.bins_per_sample - bins + width - 1
-        in_band = (number >= 0) & (number < width)
-        fractions = once(self.fractions)[np.clip(number, 0, width - 1)]
+        index = np.arange(n_tile)[None, None, :] * self.bins_per_sample - bins + width - 1
+        in_band = (index >= 0) & (index < width)
+        fractions = once(self.fractions)[np.clip(index, 0, width - 1)]
         # Optimisation barriers as in `matrix`.
         return once(jnp.where(in_band, fractions, 0.0))
 
@@ -101,20 +101,25 @@ def pulse_convolution(
 ) -> PulseConvolution:
     """Make the convolution of a lidar's pulse with its digitiser's first `n_samples` samples.
 
-    Default None: as many as the plan has. `as_band`: True for a band whatever the size. It takes less time,
-    but programs are compiled for the width of the pulse.
+    Default None: as many as the plan has. `as_band`: True for a band wherever its matrices are the smaller
+    ones, which takes less time; programs are then compiled for the width of the pulse.
     """
     # Offsets between a sample's centre and a fine bin's, in fine bins, from the last bin to the first.
     bins, bins_per_sample, n_samples = plan.bins, plan.bins_per_sample, n_samples or plan.n_samples
     # That of the first sample's centre from the first bin's.
     first_sample = (plan.sample_start - bins.start) / bins.width
     low, high = -(bins.count - 1), (n_samples - 1) * bins_per_sample
-    is_dense = not as_band and bins.count * n_samples <= MAX_DENSE_PULSE
+    # A band as wide as the pulse; of one offset at least, where the record lies beside all returns.
+    half = 0.5 * plan.sample_interval
+    band_low = max(low, math.floor((plan.pulse_support[0] - half) / bins.width - first_sample) - 2)
+    band_high = min(high, math.ceil((plan.pulse_support[1] + half) / bins.width - first_sample) + 2)
+    band_low = min(band_low, high)
+    band_high = max(band_high, band_low)
+    dense_size = bins.count * n_samples
+    is_smaller = band_size(band_high - band_low + 1, bins_per_sample) < dense_size
+    is_dense = not is_smaller or (dense_size <= MAX_DENSE_PULSE and not as_band)
     if not is_dense:
-        # A band as wide as the pulse.
-        half = 0.5 * plan.sample_interval
-        low = max(low, math.floor((plan.pulse_support[0] - half) / bins.width - first_sample) - 2)
-        high = min(high, math.ceil((plan.pulse_support[1] + half) / bins.width - first_sample) + 2)
+        low, high = band_low, band_high
     # The edges of samples lie a whole number of fine bins apart; one more at each end serves the fluxes.
     edge_offset = np.arange(low - 1, high + bins_per_sample + 2) - 0.5 * bins_per_sample
     edges = as_array((edge_offset + first_sample) * bins.width)
@@ -138,9 +143,9 @@ def _sample_fractions(
 def _narrowed(
     before: Float[Array, "..."], cumulative: Float[Array, "..."], after: Float[Array, "..."], variance: float
 ) -> Float[Array, "..."]:
-    """Return the integral of the pulse without the spread of the kernel that made deposits, F - v/2 F''.
+    """Return F - v/2 F'': the integral of the pulse, narrowed by the variance of the kernel of deposits.
 
-    `before`, `after`: the integral one fine bin earlier and later. `variance`: of the kernel, in bins.
+    `before`, `after`: the integral one fine bin earlier and later. `variance`: in bins squared.
     """
     earlier_bin = jnp.maximum(cumulative - before, 0.0)
     later_bin = jnp.maximum(after - cumulative, 0.0)

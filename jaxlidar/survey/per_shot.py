@@ -91,11 +91,12 @@ _RAYS_OF_PART, _SHOTS_AT_ONCE = 8, 8
 # fraction `rtol` of a footprint. Shots of which no ray meets an edge of a crown seem exact: with fewer rays,
 # too many of them would have an error of more than twice `rtol` ...
 _LEAST_PARTS_TIMES_RTOL = 0.04
-# ... with the error of interleaved lattices over that of as many independent ones, if they resolve edges ...
-_ERROR_OF_INTERLEAVED = MIN_BATCHES**-0.25
 # ... at no more wavelengths than there are histories: the responses of lattices, with optics applied, would
 # be larger.
-_MAX_WAVELENGTHS = 4
+MAX_WAVELENGTHS_OF_NARROW = 4
+# Standard error of the mean of interleaved lattices over that of as many independent ones, where lattices
+# resolve edges: see the module docstring.
+_ERROR_OF_INTERLEAVED = MIN_BATCHES**-0.25
 # Coarser lattices are dropped when denser ones are traced: small steps would waste most of the rays.
 _LATTICE_STEPS = StepRule(convergence_rate=0.75, safety=1.2, min_growth=2.0, max_growth=32.0)
 
@@ -152,8 +153,7 @@ def aim_offset(setup: Setup, shot: ShotGeometry) -> Float[Array, "axes"]:
 class PerShotStrategy(AbstractStrategy):
     """Every shot has photons of its own; a task is a chunk of shots.
 
-    - `resolves_edges`: True if so few columns of voxels lie within a footprint that a few rays resolve their
-      edges.
+    - `resolves_edges`: True if a few rays resolve the edges of voxels that a footprint meets.
     """
 
     resolves_edges: bool
@@ -165,9 +165,11 @@ class PerShotStrategy(AbstractStrategy):
         It depends on the survey and the plan alone, not on the number of workers.
         """
         shots = len(self.survey)
-        largest = _CHUNK_NARROW if self.resolves_edges else _CHUNK_FIRST_ORDER
-        largest = _CHUNK_HIGHER_ORDERS if self.setup.plan.orders > 1 else largest
+        largest = _CHUNK_HIGHER_ORDERS if self.setup.plan.orders > 1 else _CHUNK_FIRST_ORDER
         largest = min(largest, max(1, shots // 8))
+        if self.resolves_edges:
+            # Not fewer chunks than 32, so that many workers have something to do.
+            largest = max(largest, min(_CHUNK_NARROW, shots // 32))
         # Chunks of nearly equal size: the copies that fill up the last one are traced in vain.
         return -(-shots // -(-shots // largest))
 
@@ -388,7 +390,7 @@ def _are_narrow(setup: Setup, scene: DeviceScene) -> bool:
     """Return True if shots are narrow, and of a scene whose lattices can be traced together."""
     if scene.config.follows_higher_orders or not setup.plan.is_random:
         return False
-    few_wavelengths = setup.lidar.wavelength.size <= _MAX_WAVELENGTHS
+    few_wavelengths = setup.lidar.wavelength.size <= MAX_WAVELENGTHS_OF_NARROW
     return scene.config.n_rays <= _NARROW_RAYS and few_wavelengths and can_trace_parts(scene)
 
 

@@ -21,7 +21,7 @@ from inversion.fit.unknowns import bind_unknowns
 from jaxlidar.planning import memory
 from jaxlidar.planning.memory import check_memory, format_bytes, memory_limit
 from jaxlidar.sampling.batch_programs import make_batch_tracer
-from jaxlidar.spectral.pulse_convolution import pulse_convolution
+from jaxlidar.spectral.pulse_convolution import PulseConvolution, pulse_convolution
 from jaxlidar.spectral.waveform import waveform_of_model
 from jaxlidar.trace.device_scene import build_device_scene
 from jaxlidar.trace.higher_orders import trace_higher_orders
@@ -235,6 +235,44 @@ def test_the_band_is_the_matrix(pulse, window, monkeypatch):
     # The same test rejects a band that is a bin off.
     wrong = dataclasses.replace(band, first_offset=band.first_offset + 1)
     assert not np.allclose(wrong(fine), expected, atol=1e-6 * float(np.max(expected)))
+
+
+@pytest.mark.parametrize(
+    ("n_bins", "n_samples", "bins_per_sample", "first_offset", "width"),
+    [
+        (1, 1, 1, 0, 1),
+        (7, 5, 3, -4, 1),
+        (40, 20, 2, -17, 9),
+        (40, 6, 7, 3, 50),
+        (12, 30, 4, -60, 33),
+        (33, 2, 5, -100, 12),
+        (25, 9, 3, 20, 6),
+    ],
+)
+def test_bands_of_all_sizes_are_their_matrix(n_bins, n_samples, bins_per_sample, first_offset, width):
+    """Bins before and behind what samples take, tiles longer than the record, bands wider than the bins."""
+    fractions = jax.random.uniform(KEY, (width,))
+    sizes = {"n_bins": n_bins, "n_samples": n_samples, "bins_per_sample": bins_per_sample}
+    band = PulseConvolution(fractions, first_offset, **sizes, is_dense=False)
+    offset = np.arange(n_samples)[None, :] * bins_per_sample - np.arange(n_bins)[:, None] - first_offset
+    matrix = np.where((offset >= 0) & (offset < width), np.asarray(fractions)[offset.clip(0, width - 1)], 0.0)
+    fine = np.asarray(jax.random.normal(jax.random.key(1), (2, 3, n_bins)))
+    np.testing.assert_allclose(band(jnp.asarray(fine)), fine @ matrix, atol=1e-5)
+
+
+def test_the_smaller_of_matrix_and_band_is_applied():
+    scene = jl.Scene(ground=GROUND)
+    short, long = (jl.Lidar(pulse=jl.GaussianPulse(fwhm)) for fwhm in (4.0, 200.0))
+    window = (-200.0, 200.0)
+    chosen = [
+        pulse_convolution(lidar, jl.plan(lidar, scene, window=window, describe=False), as_band=True)
+        for lidar in (short, long)
+    ]
+    assert [convolution.is_dense for convolution in chosen] == [False, True]
+    # A record beside all returns takes nothing.
+    beside = jl.plan(short, scene, window=(-520.0, -500.0), describe=False)
+    convolution = pulse_convolution(short, beside, as_band=True)
+    assert float(jnp.abs(convolution(jnp.ones(beside.bins.count))).max()) < 1e-6
 
 
 def layers_scaled(scene, factor):

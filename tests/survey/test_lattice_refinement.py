@@ -146,6 +146,28 @@ def strategy_of(survey: jl.Survey, scene: jl.Scene):
     return choose_strategy(survey, scene, rtol=0.2, max_orders=1, window=None, shared=None)
 
 
+def with_fine_terrain(scene: jl.Scene) -> jl.Scene:
+    terrain = jl.Terrain(-0.1 * np.arange(40.0).reshape(8, 5) % 0.7 - 0.7, 0.2, (0.0, 0.0), sides="periodic")
+    return jl.Scene(canopy=scene.canopy, ground=terrain)
+
+
+@pytest.mark.parametrize(
+    ("lidar_changes", "zenith", "scene", "expected"),
+    [
+        ({}, 5.0, terrain_under(edge()), True),
+        ({}, 75.0, edge(), False),
+        ({"divergence": 1.0}, 5.0, edge(), False),
+        ({"wavelength": np.linspace(500.0, 900.0, 8)}, 5.0, edge(), False),
+        ({}, 5.0, dataclasses.replace(edge(), plates=(jl.Plate(7.0, 0.3, coverage=0.5),)), False),
+        ({}, 5.0, with_fine_terrain(edge()), False),
+    ],
+    ids=["narrow", "grazing", "wide", "spectrum", "plate", "facets"],
+)
+def test_edges_are_resolved_by_narrow_steep_beams_alone(lidar_changes, zenith, scene, expected):
+    survey = jl.Survey(dataclasses.replace(NARROW, **lidar_changes), [(9.0, 9.0), (10.0, 9.0)], zenith)
+    assert strategy_of(survey, scene).resolves_edges is expected
+
+
 def shots_of_a_tripod() -> jl.Survey:
     """Return shots of 0.3 m at 20 m, from three places beside the crown."""
     lidar = jl.Lidar(sensor=(0.0, 0.0, 1.5), divergence=15.0, pulse=jl.GaussianPulse(fwhm=4.0))

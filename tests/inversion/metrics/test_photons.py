@@ -306,6 +306,20 @@ def test_a_ground_of_few_photons_that_is_far_off_is_never_good(case):
     assert np.all(np.abs(errors_of_good_ones(case, 40)) < 2.0)
 
 
+def test_a_ground_of_enough_photons_is_good(monkeypatch):
+    """So that the test above does not pass by calling every ground doubtful."""
+    monkeypatch.setitem(SPARSE, "ten photons, by night", (2e4, 10.0, 250.0))
+    draws = 10
+    errors = errors_of_good_ones("ten photons, by night", draws)
+    n_segments = len(
+        inversion.photon_ground_and_canopy(
+            sparse_events(np.random.default_rng(0), *SPARSE["ten photons, by night"]), DISTANCE
+        ).quality
+    )
+    assert errors.size > 0.5 * draws * n_segments
+    assert np.all(np.abs(errors) < 2.0)
+
+
 def test_without_the_number_of_places_a_ground_far_off_is_good(monkeypatch):
     """Negative control: as if the ground had been sought at one place."""
     monkeypatch.setattr(photons, "_FALSE_GOOD", np.inf)
