@@ -2,12 +2,12 @@ r"""Model of a recorder in a fit: its unknowns, the record with its derivatives,
 
 **Record.** With * the convolution, sample i of a record is
 
-    y_i = scale (r * g * w)_i + b_(i mod n) + noise,
+    y_i = scale (r * g * w)(t_i - d) + b_(i mod n) + noise,
 
-with w the simulated waveform, r the receiver's impulse response, g a Gaussian of unknown width, and b_j the
-offset of digitiser j of n (`inversion.receiver.recorder`). Width, offsets and scale are unknowns of the fit
-like those of the scene, so that all standard errors include theirs. They act on w: nothing is traced or
-compiled for them.
+with w the simulated waveform, r the receiver's impulse response, g a Gaussian of unknown width, d a delay,
+and b_j the offset of digitiser j of n (`inversion.receiver.recorder`). Width, delay, offsets and scale are
+unknowns of the fit like those of the scene, so that all standard errors include theirs. They act on w:
+nothing is traced or compiled for them.
 
 **Noise of the pulse.** A recorded pulse p has noise e of its own, independent from sample to sample with the
 standard deviation sigma_p (`Recorder.pulse_noise` times the pulse's peak), and every return repeats it. With
@@ -19,14 +19,14 @@ waveform, one return a sample (Lawson and Hanson 1974, Solving Least Squares Pro
 """
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
 from scipy import linalg, optimize
 
 from inversion.fit.unknowns import MARGIN, BoundUnknown, Setter, with_start
-from inversion.receiver.recorder import OFFSET_NAME, WIDTH_NAME, ReceiverResponse, Recorder
+from inversion.receiver.recorder import DELAY_NAME, OFFSET_NAME, WIDTH_NAME, ReceiverResponse, Recorder
 from jaxlidar import Lidar
 from jaxlidar.extend import concrete
 
@@ -41,11 +41,20 @@ class RecordWithJacobian(NamedTuple):
     jacobian: np.ndarray
 
 
+class RecorderValues(NamedTuple):
+    """Values of a recorder's unknowns; 0, 0 and 1 for width, delay and scale that are no unknowns."""
+
+    width: Any
+    delay: Any
+    offsets: Any
+    scale: Any
+
+
 class RecorderModel:
     """Forward model of a recorder in a fit: its unknowns, the record and its derivatives, and its noise.
 
     The unknowns of the recorder follow those of the scene in every vector of the fit. Their values are
-    (width, offsets, scale), without those that the recorder does not have.
+    (width, delay, offsets, scale), without those that the recorder does not have.
 
     - `unknowns`: the recorder's unknowns.
 
@@ -67,12 +76,22 @@ class RecorderModel:
         has_pulse_noise = float(self.recorder.pulse_noise) > 0
         self.pulse = _pulse_fractions(lidar, bins, interval) if has_pulse_noise else None
 
-    def _split(self, values: Any) -> tuple[Any, Any, Any]:
-        """Width, offsets and scale."""
-        has_width = self.recorder.width is not None
-        # Width first, scale last, offsets in between: the order of `unknowns`.
-        offsets = values[int(has_width) : self.count - int(self.has_scale)]
-        return (values[0] if has_width else 0.0), offsets, (values[-1] if self.has_scale else 1.0)
+    def _split(self, values: Any) -> RecorderValues:
+        """Return values by name, from one vector in the order of `unknowns`."""
+        has_width, has_delay = self.recorder.width is not None, self.recorder.delay is not None
+        first_offset = int(has_width) + int(has_delay)
+        return RecorderValues(
+            width=values[0] if has_width else 0.0,
+            delay=values[first_offset - 1] if has_delay else 0.0,
+            offsets=values[first_offset : self.count - int(self.has_scale)],
+            scale=values[-1] if self.has_scale else 1.0,
+        )
+
+    def _receive(
+        self, waveform: Any, values: RecorderValues, derivative: Literal["width", "delay"] | None = None
+    ) -> Any:
+        """Return a waveform as received, or its derivative."""
+        return self.receiver(waveform, values.width, values.delay, derivative=derivative)
 
     def __call__(
         self, reflectance: np.ndarray, jacobian: np.ndarray, values: np.ndarray
@@ -84,13 +103,15 @@ class RecorderModel:
 
         **Returns:** the record, and its Jacobian with the columns of the recorder's unknowns appended.
         """
-        width, _, scale = self._split(values)
-        received = self.receiver(reflectance, width)
+        by_name = self._split(values)
+        scale, received = by_name.scale, self._receive(reflectance, by_name)
         # The response acts along the last axis, which is that of unknowns in a Jacobian.
-        scene_columns = np.moveaxis(self.receiver(np.moveaxis(jacobian, -1, 0), width), 0, -1)
+        scene_columns = np.moveaxis(self._receive(np.moveaxis(jacobian, -1, 0), by_name), 0, -1)
         columns = [scale * scene_columns]
         if self.recorder.width is not None:
-            columns.append(scale * self.receiver(reflectance, width, derivative=True)[..., None])
+            columns.append(scale * self._receive(reflectance, by_name, "width")[..., None])
+        if self.recorder.delay is not None:
+            columns.append(scale * self._receive(reflectance, by_name, "delay")[..., None])
         columns.append(
             np.broadcast_to(self.offset_columns, (*reflectance.shape, self.offset_columns.shape[-1]))
         )
@@ -103,19 +124,19 @@ class RecorderModel:
 
         **Arguments:** as of `__call__`. **Returns:** (wavelengths, bins).
         """
-        width, offsets, scale = self._split(values)
+        by_name = self._split(values)
         # No matrix product, which GPUs would round.
-        baseline = (self.offset_columns * offsets[None]).sum(axis=1).reshape(1, -1)
-        return scale * self.receiver(reflectance, width) + baseline
+        baseline = (self.offset_columns * by_name.offsets[None]).sum(axis=1).reshape(1, -1)
+        return by_name.scale * self._receive(reflectance, by_name) + baseline
 
     def scale_of(self, values: Any) -> Any:
         """Return the scale among the values of the recorder's unknowns; 1 without such an unknown."""
-        return self._split(values)[2]
+        return self._split(values).scale
 
     def received(self, batches: np.ndarray, values: np.ndarray) -> np.ndarray:
         """Return simulated batches as received and scaled, without offsets."""
-        width, _, scale = self._split(values)
-        return scale * self.receiver(batches, width)
+        by_name = self._split(values)
+        return by_name.scale * self._receive(batches, by_name)
 
     def fit_linear(
         self, values: np.ndarray, reflectance: np.ndarray, observed: np.ndarray, sigma: np.ndarray
@@ -129,7 +150,7 @@ class RecorderModel:
         simulated waveform and record. `sigma`: noise, infinite for samples without weight.
         """
         linear = np.broadcast_to(self.offset_columns, (*reflectance.shape, self.offset_columns.shape[-1]))
-        received = self.receiver(reflectance, self._split(values)[0])
+        received = self._receive(reflectance, self._split(values))
         is_used = np.isfinite(sigma)
         # Without the scale, the waveform is subtracted, and only offsets are fitted.
         fixed_record = np.zeros_like(reflectance) if self.has_scale else received
@@ -164,7 +185,7 @@ class RecorderModel:
         """
         if self.pulse is None:
             return None
-        width, _, scale = self._split(values)
+        by_name = self._split(values)
         bins, lags = self.receiver.bins, self.pulse.size
         # Returns are placed by the middle of the pulse's energy, which keeps most of an echo in the record.
         middle = int(np.argmax(np.cumsum(self.pulse) >= 0.5))
@@ -180,13 +201,13 @@ class RecorderModel:
             returns[returns < _FAINT * peak] = 0.0
             first_row = np.r_[returns[0], np.zeros(lags - 1)]
             delayed = linalg.toeplitz(np.r_[returns, np.zeros(lags - 1)], first_row)
-            noise_matrices.append(self.receiver(delayed[middle : middle + bins].T, width).T)
-        sigma = scale * float(self.recorder.pulse_noise) * float(np.max(self.pulse))
+            noise_matrices.append(self._receive(delayed[middle : middle + bins].T, by_name).T)
+        sigma = by_name.scale * float(self.recorder.pulse_noise) * float(np.max(self.pulse))
         return sigma * np.stack(noise_matrices)
 
 
 def recorder_unknowns(recorder: Recorder) -> list[BoundUnknown]:
-    """Return the unknowns of a recorder, width and offset, starting from the middle of their bounds.
+    """Return the unknowns of a recorder: width, delay and offset, from the middle of their bounds.
 
     The first simulation gives the offset a better start (`RecorderModel.fit_linear`).
     """
@@ -194,6 +215,7 @@ def recorder_unknowns(recorder: Recorder) -> list[BoundUnknown]:
     outside_scene, unknowns = Setter(None, None, "optical"), []
     shapes = {
         WIDTH_NAME: (recorder.width, ()),
+        DELAY_NAME: (recorder.delay, ()),
         OFFSET_NAME: (recorder.offset, () if recorder.interleaved == 1 else (recorder.interleaved,)),
     }
     for name, (bounds, shape) in shapes.items():

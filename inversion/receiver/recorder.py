@@ -1,16 +1,16 @@
-r"""Recorder of waveforms: the receiver's response, offsets of digitisers, noise of the pulse.
+r"""Recorder of waveforms: the receiver's response, delay, offsets of digitisers, noise of the pulse.
 
 With w the waveform simulated with the recorded pulse and * the convolution, sample i of a record is
 
-    y_i = scale (r * g * w)_i + b_(i mod n) + noise,
+    y_i = scale (r * g * w)(t_i - d) + b_(i mod n) + noise,
 
-with r the receiver's impulse response, g a Gaussian of unknown width, and b_j the offset of digitiser j of n
-that take samples in turn; one digitiser has a single baseline. The smoothing is done in the Fourier domain,
-which is exact for signals that the sampling resolves. Width, offsets and scale are unknowns of a fit:
-`inversion.fit.recorder_model`.
+with r the receiver's impulse response, g a Gaussian of unknown width, d an unknown delay, and b_j the offset
+of digitiser j of n that take samples in turn; one digitiser has a single baseline. Smoothing and delay are
+done in the Fourier domain, which is exact for signals that the sampling resolves. Width, delay, offsets and
+scale are unknowns of a fit: `inversion.fit.recorder_model`.
 """
 
-from typing import Any, final
+from typing import Any, Literal, final
 
 import equinox as eqx
 import jax
@@ -30,7 +30,7 @@ from jaxlidar.extend import (
 )
 
 # Names of the unknowns that a recorder adds to a fit.
-WIDTH_NAME, OFFSET_NAME = "receiver width", "offset"
+WIDTH_NAME, DELAY_NAME, OFFSET_NAME = "receiver width", "delay", "offset"
 
 BoundPair = tuple[float, float]
 
@@ -46,6 +46,10 @@ class Recorder(eqx.Module):
 
     - `width`: (low, high), bounds of a further unknown, "receiver width": standard deviation in ns of the
       Gaussian by which the receiver smooths. It starts at their middle. Default None: no smoothing.
+    - `delay`: (low, high), bounds of a further unknown, "delay": time in ns by which the record is late, for
+      timing that is not known; the range offset is half of it times the speed of light. It starts at their
+      middle. What moves out of the record is lost, and what moves in is dark. The same delay moves the ground
+      and everything above it: give heights bounds or priors that tell them apart. Default None: no delay.
     - `impulse`: (lags,) the receiver's response to an impulse at the record's sampling, an odd number of
       lags with time zero in the middle; its scale does not matter. It may be negative for a receiver
       that overshoots. `receiver_impulse` estimates it. Default None: none.
@@ -80,6 +84,7 @@ class Recorder(eqx.Module):
     """
 
     width: BoundPair | None = eqx.field(static=True, default=None)
+    delay: BoundPair | None = eqx.field(static=True, default=None, kw_only=True)
     impulse: Converted[Float[Array, " lags"] | None] = eqx.field(converter=_optional_impulse, default=None)
     offset: BoundPair | None = eqx.field(static=True, default=None)
     interleaved: int = eqx.field(static=True, default=1)
@@ -91,7 +96,7 @@ class Recorder(eqx.Module):
     )
 
     def __check_init__(self):
-        for field, low in (("width", 0.0), ("offset", -np.inf)):
+        for field, low in (("width", 0.0), ("delay", -np.inf), ("offset", -np.inf)):
             bounds = getattr(self, field)
             if bounds is not None:
                 _check_bounds(field, bounds, low)
@@ -121,19 +126,19 @@ class Recorder(eqx.Module):
         waveform = as_numpy(reflectance, "reflectance")
         check_number("step", step, 0.0, low_open=True)
         bins = waveform.shape[-1]
-        width = float(np.asarray(values.get(WIDTH_NAME, 0.0)))
-        received = ReceiverResponse(self, bins, step)(waveform, width)
+        width, delay = (float(np.asarray(values.get(name, 0.0))) for name in (WIDTH_NAME, DELAY_NAME))
+        received = ReceiverResponse(self, bins, step)(waveform, width, delay)
         # Repeats the offsets of the digitisers along the record.
         offset = np.resize(np.asarray(values.get(OFFSET_NAME, 0.0), float).ravel(), bins)
         return float(np.asarray(values.get("scale", 1.0))) * received + offset
 
 
 class ReceiverResponse:
-    """Convolution with the receiver's response r * g along the last axis, in the Fourier domain."""
+    """Convolution of the last axis with a receiver's response r * g, and a delay, in the Fourier domain."""
 
     def __init__(self, recorder: Recorder, bins: int, interval: float):
-        self.bins = bins
-        self.is_identity = recorder.width is None and recorder.impulse is None
+        self.bins, self.has_delay = bins, recorder.delay is not None
+        self.is_identity = recorder.width is None and recorder.delay is None and recorder.impulse is None
         lags = 1 if recorder.impulse is None else recorder.impulse.size
         # Long enough that light smoothed out of the record at one end does not come back at the other.
         self.size = 2 * bins + lags
@@ -145,18 +150,23 @@ class ReceiverResponse:
             # Time zero, the middle lag, becomes the first sample of the transform.
             self.impulse_spectrum = np.fft.rfft(np.roll(samples, -(lags // 2)))
 
-    def __call__(self, waveform: Any, width: Any, *, derivative: bool = False) -> Any:
-        """Return the waveform as received, or its derivative with respect to the width.
+    def __call__(
+        self, waveform: Any, width: Any, delay: Any, *, derivative: Literal["width", "delay"] | None = None
+    ) -> Any:
+        """Return the waveform as received, or its derivative with respect to the width or the delay.
 
         The Gaussian of width s has the spectrum exp(-(omega s)^2 / 2), with the derivative -omega^2 s times
-        that. NumPy arrays give NumPy arrays, in double precision; JAX arrays may be traced.
+        that; a delay d has exp(-i omega d), with the derivative -i omega times that. NumPy arrays give NumPy
+        arrays, in double precision; JAX arrays may be traced.
         """
         if self.is_identity:
             return waveform
         numpy: Any = jnp if isinstance(waveform, jax.Array) else np
-        phase = self.omega * width
-        factor = -phase * self.omega if derivative else 1.0
-        spectrum = self.impulse_spectrum * numpy.exp(-0.5 * phase**2) * factor
+        factors = {None: 1.0, "width": -width * self.omega**2, "delay": -1j * self.omega}
+        # A delay of zero keeps real numbers real.
+        turned = numpy.exp(-1j * self.omega * delay) if self.has_delay else 1.0
+        smoothed = numpy.exp(-0.5 * (self.omega * width) ** 2)
+        spectrum = self.impulse_spectrum * smoothed * turned * factors[derivative]
         transformed = numpy.fft.rfft(waveform, self.size)
         # JAX refuses to multiply arrays of unlike rank where a user has told it to.
         spectrum = spectrum.reshape((1,) * (waveform.ndim - 1) + (-1,))

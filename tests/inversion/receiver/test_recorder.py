@@ -1,5 +1,7 @@
 """Recorders in fits: planted offsets, smoothing and noise of a pulse are retrieved, with errors as stated."""
 
+import dataclasses
+
 import jax
 import numpy as np
 import pytest
@@ -138,10 +140,11 @@ def test_noise_of_the_recorded_pulse_is_noise_of_the_fit(jitter):
 def test_derivatives_are_those_of_differences():
     """In every unknown of the recorder, and through the simulated waveform."""
     random = np.random.default_rng(0)
-    recorder = Recorder(width=(0.2, 5.0), impulse=[0.2, 1.0, -0.1], offset=(-1.0, 1.0), interleaved=3)
+    bounds = {"width": (0.2, 5.0), "delay": (-3.0, 3.0), "offset": (-1.0, 1.0)}
+    recorder = Recorder(**bounds, impulse=[0.2, 1.0, -0.1], interleaved=3)
     model = RecorderModel(recorder, [scale_unknown((0.1, 10.0), [])], jl.Lidar(), 50)
-    # Width, three offsets and scale.
-    values = np.array([1.3, 0.1, -0.2, 0.05, 2.0])
+    # Width, delay, three offsets and scale.
+    values = np.array([1.3, 0.7, 0.1, -0.2, 0.05, 2.0])
     total, scene_jacobian = random.normal(size=(2, 50)), random.normal(size=(2, 50, 1))
     jacobian = model(total, scene_jacobian, values).jacobian
     step = 1e-5
@@ -156,6 +159,39 @@ def test_derivatives_are_those_of_differences():
         for sign in (1.0, -1.0)
     )
     np.testing.assert_allclose(jacobian[..., 0], (plus - minus) / (2.0 * step), atol=1e-8)
+
+
+def test_a_range_offset_is_retrieved_with_its_error():
+    """Echoes of ground whose height is known, by a timing that is not; planted: no such unknown."""
+    random, noise = np.random.default_rng(2), 0.005
+    pulse, delays = jl.SampledPulse(LAG, POWER), random.uniform(-6.0, 6.0, SHOTS)
+    clean = echoes(pulse, -0.149896229 * delays)
+    records = clean + noise * random.normal(size=clean.shape)
+    settings = {"noise": noise, "time": TIME, "key": jax.random.key(0), "plan": plan_of(pulse)}
+    brightness = Unknown("ground.reflectance", bounds=(0.0, 1.0), name="brightness")
+    lidar, scene = jl.Lidar(pulse=pulse), jl.Scene(ground=jl.Ground(reflectance=0.5))
+
+    def fits_with(recorder):
+        options = {"recorder": recorder, "scale": (1.0, 30.0), **settings}
+        # The gain and the reflectance are one factor: a prior settles it.
+        unknown = dataclasses.replace(brightness, prior=(0.5, 0.05))
+        return inversion.retrieve_many(records[:, None], lidar, scene, [unknown], **options)
+
+    fits = fits_with(Recorder(delay=(-8.0, 8.0)))
+    assert fits.labels == ("brightness", "delay", "scale")
+    assert is_standard_normal((fits.values["delay"] - delays) / fits.stderr["delay"])
+    assert np.all(np.abs(fits.values["delay"] - delays) < 0.1)
+    assert not is_standard_normal((fits.values["delay"] - delays - 0.05) / fits.stderr["delay"])
+    assert fits_with(Recorder()).reduced_chi2.mean() > 2.0 * fits.reduced_chi2.mean()
+
+
+def test_what_a_delay_moves_out_of_the_record_does_not_come_back():
+    waveform = np.exp(-0.5 * ((np.arange(40.0) - np.array([[3.0], [36.0]])) / 2.0) ** 2)
+    recorder = Recorder(delay=(-50.0, 50.0))
+    early, late = (recorder.recorded(waveform, {"delay": delay}) for delay in (-12.0, 12.0))
+    assert np.abs(early[0]).max() < 1e-4
+    assert np.abs(late[1]).max() < 1e-4
+    np.testing.assert_allclose(late[0, 12:], waveform[0, :-12], atol=1e-4)
 
 
 def test_light_smoothed_out_of_the_record_does_not_come_back():
