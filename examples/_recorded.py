@@ -17,13 +17,12 @@ QUALITIES = ("good", "doubtful", "bad")
 
 def columns_of_canopy(canopy, fits, i, verdict):
     """Columns of fit `i` of a batch with a layered canopy: plant area, shares of the priors, the verdict."""
-    height, log_density = float(fits.values["canopy height"][i]), fits.values["log density"][i]
-    density = np.exp(log_density)
+    estimates = canopy.estimates(fits, i)
     return {
-        "pai_layers": float(np.mean(density)) * (height - canopy.clearance),
+        "pai_layers": estimates.pai,
         "clearance": canopy.clearance,
-        "density": density,
-        "density_stderr": density * fits.robust_stderr["log density"][i],
+        "density": estimates.density,
+        "density_stderr": estimates.density_stderr,
         **quality_of(fits, i, verdict),
     }
 

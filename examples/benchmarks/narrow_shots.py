@@ -27,7 +27,7 @@ from surveys import forest, scan
 import jaxlidar as jl
 from jaxlidar import SPEED_OF_LIGHT
 from jaxlidar.planning.plan import MIN_BATCHES
-from jaxlidar.survey.per_shot import _LEAST_PARTS_TIMES_RTOL, _RAYS_OF_PART
+from jaxlidar.survey.per_shot import LEAST_PARTS_TIMES_RTOL, RAYS_OF_PART
 
 SIDE, SHOTS, SHOTS_OF_LINE, ROUNDS = 120, 5000, 20_000, 5
 TOLERANCES = (0.05, 0.02)
@@ -156,7 +156,7 @@ def by_tolerance(scene: jl.Scene) -> list[dict]:
     survey, rows = scan(SIDE, SHOTS), []
     for rtol in TOLERANCES:
         # Those of a shot in the first round.
-        rays = _RAYS_OF_PART * MIN_BATCHES * math.ceil(_LEAST_PARTS_TIMES_RTOL / rtol)
+        rays = RAYS_OF_PART * MIN_BATCHES * math.ceil(LEAST_PARTS_TIMES_RTOL / rtol)
         run = kernel(survey, scene, jl.plan(survey, scene, rtol=rtol, max_orders=1, describe=False))
         waves = simulate(survey, scene, rtol)
         # The kernel does the same work: it returns the same energy, in the mean over shots.

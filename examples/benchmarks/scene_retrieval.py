@@ -212,13 +212,13 @@ def terrain_track(shots: int) -> dict:
 
     true_scene = scene_of(lad, heights)
     records = observe(survey, true_scene)
-    # Footprint by footprint first: what each finds is where the fit of all together starts.
-    found, failed = one_by_one(survey, records, n_layers)
+    # Footprint by footprint first: what each tells is where the fit of all together starts.
+    single_fits, failed = one_by_one(survey, records, n_layers)
     nearest = np.abs(track[:, 0, None] - spacing * np.arange(len(heights))).argmin(axis=0)
     nearest_of_column = np.abs(track[:, 0, None] - 10.0 * (np.arange(shape[0]) + 0.5)).argmin(axis=0)
     # Relief of a centimetre, as heights in a plane are traced as one.
-    start_heights = found["height"][nearest][:, None] + 0.01 * random.normal(size=heights.shape)
-    start_leaf = np.repeat(found["leaf"][nearest_of_column][:, None], shape[1], axis=1)
+    start_heights = single_fits["height"][nearest][:, None] + 0.01 * random.normal(size=heights.shape)
+    start_leaf = np.repeat(single_fits["leaf"][nearest_of_column][:, None], shape[1], axis=1)
     start = scene_of(start_leaf, np.clip(start_heights, 0.0, 12.0))
     leaf = inversion.Unknown(
         "canopy.voxels.leaf", bounds=(0.0, 2.0), name="leaf", prior=inversion.MarkovField(0.1)
@@ -230,7 +230,7 @@ def terrain_track(shots: int) -> dict:
     inner = slice(shots // 20, -shots // 20)
     true_height = np.asarray(true_scene.ground.height_at(*track.T))
     together = np.asarray(fit.scene.ground.height_at(*track.T)) - true_height
-    alone = found["height"] - true_height
+    alone = single_fits["height"] - true_height
 
     def rms(error: np.ndarray) -> float:
         return float(np.sqrt(np.mean(error[inner] ** 2)))

@@ -258,7 +258,9 @@ def _rh_positions(
     """
     # Noise must not make the cumulated energy fall: the search needs it sorted.
     fraction = np.maximum.accumulate(energy_below, axis=-1)
-    fraction /= np.maximum(energy_below[..., -1:], np.finfo(fraction.dtype).tiny)
+    # Records of noise alone may have no energy in all: their fractions are infinite, and their metrics NaN.
+    with np.errstate(over="ignore"):
+        fraction /= np.maximum(energy_below[..., -1:], np.finfo(fraction.dtype).tiny)
     levels = _RH_FRACTIONS.astype(fraction.dtype)
     size = fraction.shape[-1]
     n_below = [np.searchsorted(row, levels) for row in fraction.reshape(-1, size)]

@@ -86,11 +86,11 @@ _BATCH_STEPS = StepRule(max_growth=1.0, min_step=4)
 # Lattices of at most so many rays are those of narrow footprints ...
 _NARROW_RAYS = 64
 # ... which are traced in parts of so many rays, for so many shots together ...
-_RAYS_OF_PART, _SHOTS_AT_ONCE = 8, 8
+RAYS_OF_PART, _SHOTS_AT_ONCE = 8, 8
 # ... with as many parts in the first round that about three rays of all lattices meet what covers the
 # fraction `rtol` of a footprint. Shots of which no ray meets an edge of a crown seem exact: with fewer rays,
 # too many of them would have an error of more than twice `rtol` ...
-_LEAST_PARTS_TIMES_RTOL = 0.04
+LEAST_PARTS_TIMES_RTOL = 0.04
 # ... at no more wavelengths than there are histories: the responses of lattices, with optics applied, would
 # be larger.
 MAX_WAVELENGTHS_OF_NARROW = 4
@@ -412,11 +412,11 @@ def _trace_narrow_shots(
     2. Trace the pending shots, several at a time, and replace their results.
     """
     n_shots = len(shots.number)
-    max_parts = MAX_BATCHES_OR_PARTS * scene.config.n_rays // _RAYS_OF_PART
+    max_parts = MAX_BATCHES_OR_PARTS * scene.config.n_rays // RAYS_OF_PART
     error_factor = _ERROR_OF_INTERLEAVED if resolves_edges else 1.0
     # Not more than where shots are not narrow.
-    most = -(-scene.config.n_rays // _RAYS_OF_PART)
-    first_parts = jnp.clip(jnp.ceil(_LEAST_PARTS_TIMES_RTOL / rtol), 1, most).astype(jnp.int32)
+    most = -(-scene.config.n_rays // RAYS_OF_PART)
+    first_parts = jnp.clip(jnp.ceil(LEAST_PARTS_TIMES_RTOL / rtol), 1, most).astype(jnp.int32)
 
     def is_pending(n_parts: Array, results: ShotResults) -> Array:
         return (n_parts == 0) | ((results.error > rtol) & (n_parts < max_parts))
@@ -501,7 +501,7 @@ def _trace_together(
             shifts=shifts[row, lattice],
             ray_slices=RaySlice(jnp.where(exists, part, 0), count),
         )
-        return add_parts(scene_of_first, tally, parts, n_lattices, _RAYS_OF_PART)
+        return add_parts(scene_of_first, tally, parts, n_lattices, RAYS_OF_PART)
 
     no_rays = empty_tally(scene_of_first, n_lattices)
     tally = jax.lax.fori_loop(0, -(-ends[-1] // block_size), add_block, no_rays)
