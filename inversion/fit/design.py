@@ -279,20 +279,20 @@ def design(
     def bound_of(flat: Array, traced: TracedScene, scene_noise: Any) -> CramerRao:
         return _cramer_rao(free_values.lidar_with(lidar, flat), traced, scene_noise, names, shapes, labels)
 
-    def cost_at(flat: Array, traced: TracedScene, scene_noise: Any) -> Array:
+    def cost_of_scene(flat: Array, traced: TracedScene, scene_noise: Any) -> Array:
         return jnp.asarray(cost_of_bound(bound_of(flat, traced, scene_noise))).reshape(())
 
     @eqx.filter_jit
     def cost_and_slopes(fraction: Array, traced: TracedScene, scene_noise: Any) -> tuple[Array, Array]:
         def of_fraction(fraction: Array) -> Array:
             low, high = jnp.asarray(free_values.low), jnp.asarray(free_values.high)
-            return cost_at(low + fraction * (high - low), traced, scene_noise)
+            return cost_of_scene(low + fraction * (high - low), traced, scene_noise)
 
         return jax.value_and_grad(of_fraction)(fraction)
 
     def mean_cost(flat: np.ndarray, traced_scenes: list[TracedScene]) -> float:
         pairs = zip(traced_scenes, noises)
-        return float(np.mean([float(cost_at(jnp.asarray(flat), *pair)) for pair in pairs]))
+        return float(np.mean([float(cost_of_scene(jnp.asarray(flat), *pair)) for pair in pairs]))
 
     start = np.concatenate([np.ravel(np.asarray(value, float)) for value in free_values.of(lidar)])
     initial_cost = mean_cost(start, traced_scenes)
@@ -327,15 +327,15 @@ def design(
     ) -> list[TracedScene]:
         """Trace divergences between fractions of the limits, until the cost is known between them.
 
-        `flat`: values of which all others are used.
+        `flat`: values of all free variables; that of the divergence is not used.
         """
         low, high = ((free_values.low + end * width)[is_divergence] for end in (lower, upper))
 
-        def cost_at(divergence: float, traced_scenes: list[TracedScene]) -> float:
+        def cost_by_divergence(divergence: float, traced_scenes: list[TracedScene]) -> float:
             return mean_cost(np.where(is_divergence, divergence, flat), traced_scenes)
 
         nodes = DivergenceNodes(float(low[0]), float(high[0]), _FIRST_NODES)
-        return _refined(trace(lidar, nodes), cost_at, photon_key, tolerance)
+        return _refined(trace(lidar, nodes), cost_by_divergence, photon_key, tolerance)
 
     width = free_values.high - free_values.low
     first = (start - free_values.low) / width
@@ -383,7 +383,7 @@ def design(
 
 def _refined(
     traced_scenes: list[TracedScene],
-    cost_at: Callable[[float, list[TracedScene]], float],
+    cost_by_divergence: Callable[[float, list[TracedScene]], float],
     key: PRNGKeyArray,
     tolerance: float,
 ) -> list[TracedScene]:
@@ -392,13 +392,13 @@ def _refined(
     The error is that at each new node, of the interpolation between those before. It counts where the cost is
     not far above the lowest one: elsewhere, divergences that tell little have large relative errors.
 
-    `cost_at`: cost by divergence and traced scenes.
+    `cost_by_divergence`: the mean cost over traced scenes, at a divergence.
     """
     while True:
         refined = [refine_nodes(traced, key) for traced in traced_scenes]
         nodes: Any = refined[0].nodes
         interpolated, exact = (
-            np.array([cost_at(divergence, scenes) for divergence in nodes.divergences[1::2]])
+            np.array([cost_by_divergence(divergence, scenes) for divergence in nodes.divergences[1::2]])
             for scenes in (traced_scenes, refined)
         )
         # Not finite where no record determines an unknown: no design has such a divergence.
@@ -488,8 +488,8 @@ def _plan(
     ends = [free_values.lidar_with(lidar, jnp.asarray(end)) for end in (free_values.low, free_values.high)]
     # Two wavelengths that start from one limit are equal: those of the lidar itself serve here. Plans that
     # are united have one sampling interval.
-    own = {"wavelength": lidar.wavelength, "sampling_interval": lidar.sampling_interval}
-    cases = [(dataclasses.replace(end, **own), scene) for end in ends for scene in scenes]
+    fixed_fields = {"wavelength": lidar.wavelength, "sampling_interval": lidar.sampling_interval}
+    cases = [(dataclasses.replace(end, **fixed_fields), scene) for end in ends for scene in scenes]
     if "sampling_interval" in free_values.paths:
         shortest = dataclasses.replace(ends[0], wavelength=lidar.wavelength)
         finest = plan_cases([(shortest, scene) for scene in scenes], window=None, **options)

@@ -89,7 +89,8 @@ def simulation_bytes(
       optics are applied while light is traced.
     """
     response = response_bytes(config, bins, degree=degree, n_traces=n_traces)
-    # Applied as a matrix, or as a band where that is larger than `MAX_DENSE_PULSE` and than the band.
+    # The pulse is applied as a matrix of fine bins and samples. One above `MAX_DENSE_PULSE` gives way to a
+    # band, if that is smaller.
     n_elements = bins.count * n_samples
     if n_elements > MAX_DENSE_PULSE:
         n_elements = min(n_elements, band_size(pulse_bins, bins_per_sample))
