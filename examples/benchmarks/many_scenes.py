@@ -6,10 +6,13 @@ through eight orders, with several numbers of photons in each of eight batches. 
 of a waveform, from the differences between two random keys.
 """
 
+from pathlib import Path
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 from _common import machine, new_figure, options, print_table, save_figure, seconds, write_json
+from matplotlib.ticker import LogLocator, NullFormatter
 
 import jaxlidar as jl
 
@@ -60,13 +63,22 @@ def main() -> None:
             }
         )
     write_json(arguments.out / "many_scenes.json", {"machine": machine(), "rows": rows})
+    draw(rows, arguments.out)
+    print_table(tuple(rows[0]), [tuple(r.values()) for r in rows])
+
+
+def draw(rows: list[dict], out: Path) -> None:
+    """Draw the error of a scene by its time."""
     figure, axes = new_figure()
     axes.loglog([r["ms per scene"] for r in rows[1:]], [100 * r["error"] for r in rows[1:]], "o-")
     axes.axvline(rows[0]["ms per scene"], color="0.5", ls="--", label="first order")
     axes.set(xlabel="ms per scene", ylabel="error of the sum of a waveform, %", title="eight orders")
     axes.legend()
-    save_figure(figure, arguments.out / "many_scenes.png")
-    print_table(tuple(rows[0]), [tuple(r.values()) for r in rows])
+    for axis in (axes.xaxis, axes.yaxis):
+        axis.set(
+            major_locator=LogLocator(subs=(1, 3)), major_formatter="{x:g}", minor_formatter=NullFormatter()
+        )
+    save_figure(figure, out / "many_scenes.png")
 
 
 if __name__ == "__main__":

@@ -234,7 +234,7 @@ def draw(record: dict, out: Path) -> None:
         label = {"march": "march of the first rays (numba)"}.get(name, name)
         axes.barh(labels, length, left=left, label=label)
         left += length
-    axes.set(xlabel="µs per shot")
+    axes.set(xlabel="µs per shot", xlim=(0.0, 1.05 * float(left.max())))
     axes.invert_yaxis()
     figure.legend(loc="outside upper center", ncols=5, fontsize="small", frameon=False)
     save_figure(figure, out / "narrow_shots.png")
