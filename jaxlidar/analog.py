@@ -17,6 +17,7 @@ from jaxlidar._checks import briefly, check_integer, check_key, check_number
 from jaxlidar._constants import SPEED_OF_LIGHT
 from jaxlidar._mesh_axes import vary_together, vary_with, with_automatic_axes
 from jaxlidar._vectors import along, dot
+from jaxlidar._vmapped_loops import any_problem
 from jaxlidar.instrument.lidar import Lidar
 from jaxlidar.planning.plan import Plan
 from jaxlidar.planning.setup import make_setup
@@ -124,7 +125,7 @@ def _analog_returns(
                 arrivals = jax.tree.map(lambda a, b: jnp.where(arrived.value > 0, a, b), arrived, arrivals)
                 return onward, arrivals
 
-            return lax.cond(jnp.any(carry[0].alive), trace, lambda c: c, carry), None
+            return lax.cond(any_problem(carry[0].alive), trace, lambda c: c, carry), None
 
         zeros = jnp.zeros_like(start.weight)
         no_arrivals = _Arrivals(zeros, zeros, start.history)

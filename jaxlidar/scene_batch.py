@@ -20,7 +20,7 @@ from jaxlidar._programs import Program
 from jaxlidar._threads import ONE_CORE, side_by_side
 from jaxlidar.instrument.lidar import Lidar
 from jaxlidar.planning.memory import memory_limit, transformed_bytes
-from jaxlidar.planning.plan import MIN_BATCHES, Plan
+from jaxlidar.planning.plan import Plan
 from jaxlidar.planning.scene_family import plan_scenes, stack_size
 from jaxlidar.scenes.scene import Scene, check_kinds
 from jaxlidar.simulate import simulate
@@ -165,9 +165,7 @@ def simulate_scenes(
 
 def _affordable_chunk(plan: Plan) -> int:
     """Return the number of scenes at once that the plan's memory has room for."""
-    size = transformed_bytes(
-        plan.config, plan.bins, degree=plan.degree, n_traces=plan.n_traces, batches=MIN_BATCHES
-    )
+    size = transformed_bytes(plan.config, plan.bins, degree=plan.degree, n_traces=plan.n_traces)
     chunks_at_once = os.cpu_count() or 1
     return max(1, min(MAX_CHUNK, int(memory_limit(plan.scope.max_memory) / (chunks_at_once * size))))
 

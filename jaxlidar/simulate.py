@@ -354,18 +354,25 @@ class LateLightWarning(UserWarning):
 def _trace_transformed(tracer: BatchTracer, key: PRNGKeyArray) -> _BatchResults:
     """Trace a fixed number of batches, within a JAX transformation."""
 
-    def trace_batch(key: PRNGKeyArray) -> tuple[Response, Array, BudgetTerms]:
+    def trace_batch(key: PRNGKeyArray) -> tuple[Response, tuple[Array, BudgetTerms]]:
         response = trace_device_scene(tracer.scene, key)
-        return response, *samples_and_budget(response, tracer.model)
+        return response, samples_and_budget(response, tracer.model)
 
-    responses, samples, terms = jax.lax.map(trace_batch, jax.random.split(key, MIN_BATCHES))
+    def add_batch(total: Response, key: PRNGKeyArray) -> tuple[Response, tuple[Array, BudgetTerms]]:
+        response, estimates = trace_batch(key)
+        return jax.tree.map(jnp.add, total, response), estimates
+
+    # The sum is carried: responses of all batches together would take several times the memory.
+    keys = jax.random.split(key, MIN_BATCHES)
+    shapes = jax.eval_shape(trace_batch, keys[0])[0]
+    zero = jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), shapes)
+    response_sum, (samples, terms) = jax.lax.scan(add_batch, zero, keys)
 
     def stderr(values: Array) -> Array:
         # Standard errors have no derivatives: they would be those of the noise.
         variance = jnp.var(jax.lax.stop_gradient(values), axis=0)
         return student_widening(MIN_BATCHES) * jnp.sqrt(variance / (MIN_BATCHES - 1))
 
-    response_sum = jax.tree.map(lambda a: jnp.sum(a, axis=0), responses)
     energy_budget_stderr = jax.tree.map(stderr, terms.energy_budget)
     return _BatchResults(response_sum, MIN_BATCHES, stderr(samples), energy_budget_stderr, {})
 

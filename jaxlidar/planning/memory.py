@@ -138,13 +138,11 @@ def jacobian_bytes(
     return (batches + 1) * response + cores * (response + columns * tangents)
 
 
-def transformed_bytes(
-    config: TraceConfig, bins: TimeBins, *, degree: int, n_traces: int, batches: int
-) -> float:
-    """Return the bytes of one simulation within a JAX transformation, which keeps all of its batches."""
+def transformed_bytes(config: TraceConfig, bins: TimeBins, *, degree: int, n_traces: int) -> float:
+    """Return the bytes of one simulation within a JAX transformation: a batch, and the sum of all."""
     response = response_bytes(config, bins, degree=degree, n_traces=n_traces)
     states = _STATE_NUMBERS * _photons_and_segments(config) * _number_bytes()
-    return (batches + _RESPONSE_COPIES) * response + states
+    return (1 + _RESPONSE_COPIES) * response + states
 
 
 def scored_bytes(config: TraceConfig, bins: TimeBins, *, cells: int, columns: int, wavelengths: int) -> float:

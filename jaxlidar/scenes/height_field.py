@@ -39,6 +39,7 @@ from jaxlidar._checks import concrete_array
 from jaxlidar._mesh_axes import vary_together
 from jaxlidar._one_function import once
 from jaxlidar._vectors import FAR, Scalar, Vec, along, dot, normalise, vec, with_derivative_of
+from jaxlidar._vmapped_loops import any_problem
 from jaxlidar.scenes.raster import Cell, Raster
 from jaxlidar.scenes.shapes import AbstractShape
 
@@ -284,7 +285,7 @@ class HeightField(AbstractShape):
         """Follow rays from cell to cell, for `max_steps` or until at most `stop_at` of them are active."""
 
         def continue_(state: _Traversal) -> Bool[Array, ""]:
-            return (jnp.sum(state.active) > stop_at) & (state.steps < max_steps)
+            return any_problem(jnp.sum(state.active) > stop_at) & (state.steps < max_steps)
 
         def advance(state: _Traversal) -> _Traversal:
             # `once` is an optimisation barrier: compilers would compute shared values again for every field

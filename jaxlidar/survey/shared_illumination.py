@@ -488,7 +488,9 @@ def sum_contributions(
         if sums is None:
             # Always as many shots, so that one compiled program completes all blocks; in double precision.
             sums = jax.tree.map(lambda a: np.zeros((SHOTS_PER_BLOCK, *a.shape[1:])), arrays)
-        jax.tree.map(lambda s, a, r=rows, m=mine: np.add.at(s, r, a[m]), sums, arrays)
+        # A contribution names each shot once.
+        for total, added in zip(jax.tree.leaves(sums), jax.tree.leaves(arrays)):
+            total[rows] += added[mine]
     # Variances of groups add up, since their photons are independent.
     of_shots = ShotSums(
         components=sums["lines"],

@@ -17,6 +17,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from jaxlidar._vectors import Vec, along, vec
+from jaxlidar._vmapped_loops import any_problem
 from jaxlidar.planning.config import Scatterer
 from jaxlidar.scenes.height_field import HeightField
 from jaxlidar.trace.device_scene import DeviceScene
@@ -114,7 +115,7 @@ def trace_to_end(
     start = _PhotonLoop(photons, energy, fractions, jnp.zeros((), jnp.int32))
 
     def continue_(loop: _PhotonLoop) -> Bool[Array, ""]:
-        return jnp.any(loop.photons.alive) & (loop.order < max_orders)
+        return any_problem(loop.photons.alive) & (loop.order < max_orders)
 
     def step(loop: _PhotonLoop) -> _PhotonLoop:
         return _trace_order(scene, optics, loop, jax.random.fold_in(key, loop.order))

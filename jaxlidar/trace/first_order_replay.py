@@ -24,6 +24,7 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from jaxlidar._vectors import Scalar
+from jaxlidar._vmapped_loops import largest_count
 from jaxlidar.trace.device_scene import DeviceScene
 from jaxlidar.trace.first_order import (
     FirstOrder,
@@ -86,7 +87,7 @@ def pull_back_first_order(
 
         # Step 3. The loop ends with the last step at which any ray is still in the medium.
         numbers = jnp.arange(segments.length.shape[0])
-        n_steps = jnp.max(jnp.where(jnp.any(segments.length > 0.0, axis=1), numbers + 1, 0))
+        n_steps = largest_count(jnp.where(jnp.any(segments.length > 0.0, axis=1), numbers + 1, 0))
 
         def add_step(n, state: tuple[ExtinctionTables, Scalar]) -> tuple[ExtinctionTables, Scalar]:
             tables, of_depth_behind = state

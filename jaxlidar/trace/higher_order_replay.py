@@ -29,6 +29,7 @@ from jaxtyping import Array, Bool, Float, Int, UInt32
 
 from jaxlidar._one_function import once
 from jaxlidar._vectors import Scalar, Vec
+from jaxlidar._vmapped_loops import any_problem
 from jaxlidar.trace.device_scene import DeviceScene
 from jaxlidar.trace.higher_orders import (
     FlightEnds,
@@ -211,7 +212,7 @@ def _subtract_lengths(
         return _SubtractingMarch(distance, next_depth, next_voxel, goes_on, n_steps + 1, tables)
 
     def continue_(state: _SubtractingMarch) -> Bool[Array, ""]:
-        return jnp.any(state.running) & (state.n_steps < scene.config.max_faces)
+        return any_problem(state.running) & (state.n_steps < scene.config.max_faces)
 
     # Of rays whose amounts are all zero, nothing would be subtracted.
     running = jnp.any(amounts != 0.0, axis=0) & (ray.enter < end)

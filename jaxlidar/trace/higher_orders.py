@@ -42,6 +42,7 @@ from jaxlidar._constants import SPEED_OF_LIGHT
 from jaxlidar._mesh_axes import vary_with
 from jaxlidar._one_function import once
 from jaxlidar._vectors import FAR, Scalar, Vec, along
+from jaxlidar._vmapped_loops import any_problem, largest_count
 from jaxlidar.trace.collisions import collision_for_return, intensity_factors
 from jaxlidar.trace.compaction import compact
 from jaxlidar.trace.deposit import add_rows, bspline_row
@@ -206,7 +207,8 @@ class PhotonBatch:
 
             def scanned_chunk(sums, chunk):
                 in_chunk = gather(chunk)
-                in_chunk, sums = lax.cond(jnp.any(in_chunk.photons.alive), trace_again, skip, in_chunk, sums)
+                any_alive = any_problem(in_chunk.photons.alive)
+                in_chunk, sums = lax.cond(any_alive, trace_again, skip, in_chunk, sums)
                 return sums, in_chunk
 
             def looped_chunk(chunk, state):
@@ -221,7 +223,7 @@ class PhotonBatch:
             # Chunks of dead photons are not even looked at.
             none_alive = jnp.zeros_like(lanes.photons.alive)
             all_dead = eqx.tree_at(lambda c: c.photons.alive, lanes, none_alive)
-            n_living_chunks = -(-n_living // chunk_size)
+            n_living_chunks = -(-largest_count(n_living) // chunk_size)
             return lax.fori_loop(0, n_living_chunks, looped_chunk, (all_dead, sums))
 
         def order_step(carry, order):

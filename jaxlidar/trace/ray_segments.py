@@ -24,6 +24,7 @@ from jaxlidar._constants import SPEED_OF_LIGHT
 from jaxlidar._mesh_axes import vary_together
 from jaxlidar._one_function import once
 from jaxlidar._vectors import Scalar, Vec
+from jaxlidar._vmapped_loops import largest_count
 from jaxlidar.planning.config import TimeBins
 from jaxlidar.trace.deposit import padded_index
 from jaxlidar.trace.voxel_traversal import Medium, cell_index, enter_grid, maximum, minimum, step_voxel
@@ -215,5 +216,5 @@ def add_in_blocks(
         in_block = eqx.tree_at(lambda s: s.length, in_block, jnp.where(is_real, in_block.length, 0.0))
         return add(tally, in_block, jax.tree.map(lambda a: a[numbers % shape[1]], per_ray))
 
-    n_blocks = (upto[-1] + (SEGMENTS_AT_ONCE - 1)) // SEGMENTS_AT_ONCE
+    n_blocks = (largest_count(upto[-1]) + (SEGMENTS_AT_ONCE - 1)) // SEGMENTS_AT_ONCE
     return lax.fori_loop(0, n_blocks, block, tally)

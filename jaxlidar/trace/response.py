@@ -24,7 +24,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from jaxlidar._checks import briefly, check_flag, check_key, check_kind
 from jaxlidar._deprecated import renamed_property
 from jaxlidar._mesh_axes import vary_together, vary_with, with_automatic_axes
-from jaxlidar._products import einsum
+from jaxlidar._products import einsum, tensordot
 from jaxlidar.planning.setup import Setup
 from jaxlidar.trace.device_scene import DeviceScene, build_device_scene
 from jaxlidar.trace.first_order import FirstOrder, first_order
@@ -154,9 +154,32 @@ def trace_first_only(scene: DeviceScene, key: PRNGKeyArray, ray_slice: RaySlice 
     """Trace the response of one batch of a scene that has one order; or of a slice of its rays."""
 
     def trace(scene: DeviceScene) -> Response:
-        return first_order_response(scene, *_first(scene, key, ray_slice))
+        response = first_order_response(scene, *_first(scene, key, ray_slice))
+        return response if scene.optics is None else apply_optics_to_first(response, scene)
 
     return _for_each_trace(trace, scene)
+
+
+def apply_optics_to_first(response: Response, scene: DeviceScene) -> Response:
+    """Apply optics to a response of one trace and of order one alone: wavelengths become traces."""
+    assert scene.optics is not None
+    monomials = scene.first_histories.monomials(scene.optics)
+
+    def apply(a: Array, history_axis: int) -> Array:
+        by_wavelength = tensordot(monomials, a[0], axes=(0, history_axis))
+        return jnp.expand_dims(by_wavelength, 1 + history_axis)
+
+    return Response(
+        first=apply(response.first, 1),
+        higher=None,
+        first_outside=apply(response.first_outside, 1),
+        higher_outside=None,
+        arrived=apply(response.arrived, 1),
+        departed=apply(response.departed, 1),
+        escaped=apply(response.escaped, 0),
+        late=apply(response.late, 0),
+        remaining=apply(response.remaining, 0),
+    )
 
 
 class FirstOrderResponse(eqx.Module):

@@ -27,7 +27,13 @@ from jaxlidar.trace.entry_nodes import EntryNodes
 from jaxlidar.trace.first_order import FirstOrder, first_order
 from jaxlidar.trace.higher_orders import trace_higher_orders
 from jaxlidar.trace.histories import Histories
-from jaxlidar.trace.response import FirstOrderResponse, Response, first_order_response, trace_first
+from jaxlidar.trace.response import (
+    FirstOrderResponse,
+    Response,
+    apply_optics_to_first,
+    first_order_response,
+    trace_first,
+)
 
 
 def trace_nodes(scene: DeviceScene, nodes: EntryNodes, key: PRNGKeyArray) -> Response:
@@ -54,7 +60,7 @@ def trace_nodes(scene: DeviceScene, nodes: EntryNodes, key: PRNGKeyArray) -> Res
     first = jax.tree.map(lambda a: jax.ops.segment_sum(a, nodes.group_node, n_nodes), groups)
     if not scene.config.follows_higher_orders:
         response = jax.vmap(lambda f: first_order_response(scene, f, f.weights))(first)
-        return _apply_optics_to_first(response, scene)
+        return jax.vmap(lambda r: apply_optics_to_first(r, scene))(response)
     # Order one has few histories, and keeps them until here; photons had optics applied on the way.
     histories, optics = scene.first_histories, scene.optics
     n_wavelengths = optics.shape[1]
@@ -88,27 +94,6 @@ def _apply_optics(
     """Sum weights over histories with optics; wavelengths become the second axis."""
     by_wavelength = einsum("hw,...hc->...wc", histories.monomials(optics), weights)
     return jnp.expand_dims(jnp.moveaxis(by_wavelength, -2, 1), -2)
-
-
-def _apply_optics_to_first(response: Response, scene: DeviceScene) -> Response:
-    """Apply optics to a response of order one alone, which has one trace."""
-    assert scene.optics is not None
-    histories, optics = scene.first_histories, scene.optics
-
-    def apply(a: Array) -> Array:
-        return _apply_optics(a[:, 0, ..., None], histories, optics)[..., 0]
-
-    return Response(
-        first=_apply_optics(response.first[:, 0], histories, optics),
-        higher=None,
-        first_outside=apply(response.first_outside),
-        higher_outside=None,
-        arrived=apply(response.arrived),
-        departed=apply(response.departed),
-        escaped=apply(response.escaped),
-        late=apply(response.late),
-        remaining=apply(response.remaining),
-    )
 
 
 def trace_shots(scene: DeviceScene, lidar: Lidar, nodes: EntryNodes, key: PRNGKeyArray) -> Response:

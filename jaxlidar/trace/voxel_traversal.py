@@ -24,6 +24,7 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxlidar._mesh_axes import vary_together
 from jaxlidar._one_function import once, one_function
 from jaxlidar._vectors import FAR, Scalar, Vec
+from jaxlidar._vmapped_loops import any_problem
 from jaxlidar.optics.leaf_angles import ANGLE_NODES, LeafAngles
 from jaxlidar.optics.phase import AbstractPhase
 from jaxlidar.planning.size_buckets import size_bucket
@@ -418,7 +419,7 @@ def march_to_depths(
         def run(state):
             return lax.scan(step, state, None, length=STEPS_PER_CHECK)[0]
 
-        return lax.cond(jnp.any(state.running), run, lambda s: s, state), None
+        return lax.cond(any_problem(state.running), run, lambda s: s, state), None
 
     zero = jnp.zeros_like(targets)
     # Entered at -1: not crossed.

@@ -91,6 +91,23 @@ def test_the_chunk_size_does_not_matter(reference_wave, monkeypatch):
     assert float(np.max(wave.components["higher"])) > 0.01 * float(np.max(wave.reflectance))
 
 
+@pytest.mark.parametrize("parts", ["ground", "canopy", "plates"])
+def test_optics_of_one_order_are_applied_by_history_or_in_the_trace(parts):
+    lidar, scene = build(zenith=0.0)
+    if parts != "canopy":
+        scene = eqx.tree_at(lambda s: s.canopy, scene, None)
+    if parts == "plates":
+        plate = jl.Plate(5.0, np.array([0.2, 0.4, 0.5]), np.array([0.1, 0.3, 0.2]), coverage=0.6)
+        scene = jl.Scene(plates=[plate], ground=scene.ground)
+    plans = (jl.plan(lidar, scene, max_orders=1, n_rays=64, histories=keeps) for keeps in (True, False))
+    by_history, applied = (jl.simulate(lidar, scene, key=KEY, plan=plan, rtol=0.1) for plan in plans)
+    assert float(jnp.max(by_history.reflectance)) > 1e-3
+    assert_alike(applied.reflectance, by_history.reflectance, 1e-5)
+    assert_alike(applied.lost, by_history.lost, 1e-5)
+    for name, fraction in by_history.energy_budget.items():
+        np.testing.assert_allclose(applied.energy_budget[name], fraction, rtol=1e-5, atol=1e-7)
+
+
 @pytest.mark.slow
 def test_one_trace_serves_every_wavelength(reference_wave):
     plan, wave = reference_wave
