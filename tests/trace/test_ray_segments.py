@@ -85,6 +85,26 @@ def test_blocks_hold_every_segment_once(block: int, monkeypatch: pytest.MonkeyPa
     np.testing.assert_array_equal(sums, np.where((length > 0) & (extinction > 0), ray_weight, 0.0))
 
 
+@pytest.mark.parametrize("count", [1, 2, 22])
+def test_transmittances_at_steps_are_exponential_functions(count):
+    depth, step = jnp.array([0.0, 0.3, 2.0, 50.0]), jnp.array([0.0, 0.01, 0.4, 20.0])
+
+    def by_powers(depth, step):
+        return ray_segments._transmittances_at_steps(depth, step, count)
+
+    def expected(depth, step):
+        return jax.vmap(lambda n: jnp.exp(-(depth + n * step)))(jnp.arange(float(count)))
+
+    np.testing.assert_allclose(by_powers(depth, step), expected(depth, step), rtol=5e-6, atol=1e-37)
+    for tangents in ((jnp.ones(4), jnp.zeros(4)), (jnp.zeros(4), jnp.ones(4))):
+        slopes, exact = (jax.jvp(f, (depth, step), tangents)[1] for f in (by_powers, expected))
+        np.testing.assert_allclose(slopes, exact, rtol=5e-6, atol=1e-35)
+    gradients, exact = (
+        jax.grad(lambda *x, f=f: jnp.sum(f(*x)), (0, 1))(depth, step) for f in (by_powers, expected)
+    )
+    np.testing.assert_allclose(np.stack(gradients), np.stack(exact), rtol=5e-6, atol=1e-35)
+
+
 @pytest.mark.slow
 def test_empty_voxels_have_their_derivatives():
     """Forward, in reverse, and as differences; skipping empty voxels would make them zero."""
