@@ -809,7 +809,7 @@ ENTRY_POINTS: dict[str, Callable[[], EntryPoint]] = {
             survey=jl.Survey(jl.Lidar(divergence=20.0), TWO), scene=GROUND, key=KEY, **arguments
         ),
         {"records": np.stack([POWER, POWER]), "height": HEIGHT, "noise": 0.01, "search_radius": 2.0}
-        | {"height_error": 0.1, "max_orders": 1, "rtol": 0.1},
+        | {"height_error": 0.1, "ratio_error": 0.5, "max_orders": 1, "rtol": 0.1},
     ),
     "inversion.retrieve_scene": lambda: EntryPoint(
         lambda **arguments: inversion.retrieve_scene(

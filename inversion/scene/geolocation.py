@@ -10,21 +10,44 @@ stands for an integral; with the beams chosen here its error is 2e-4 of the wave
 Poisson's summation formula beyond the first). The nodes are simulated once, with all that the tracer knows.
 Derivatives with respect to the position p are those of g, exact for this sum.
 
-**Fit.** Record i is a_i W(p_i + D_i theta) and noise, with a free factor a_i, the shift theta, and D_i = 1;
-with drift, the shift varies linearly along the survey. The factors are eliminated (variable projection, Golub
-and Pereyra 1973): chi-squared is first evaluated on a grid of shifts, then Gauss-Newton steps, damped by
-Levenberg and Marquardt, start from its lowest minima.
+**Fit.** Record i is a_i (b P + R)(p_i + D_i theta), its misfit and noise. P is the light from plants and R
+all other, a_i a free factor of the record, b one of the survey (the reflectance of plants over that of the
+ground, relative to the scene's; its logarithm has a normal prior), theta the shift, and D_i = 1; with drift,
+the shift varies linearly along the survey. The factors a_i are eliminated (variable projection, Golub and
+Pereyra 1973).
 
-**Covariance.** Residuals have noise and errors of the scene, which are correlated within a record. With the
-score vectors s_i = J_i^T r_i of the records and the information F = sum of J_i^T J_i, the covariance is
+**Misfit.** A scene does not explain records to their noise: columns of the canopy are brighter or darker than
+it says. This changes whole layers of a record at once. The misfit of record i is therefore a_i W_i(h) c
+f_i(h), where f_i is a Gaussian process of the height h with unit variance and the correlation exp(-(h - h')^2
+/ (2 l^2)), independent from record to record. In
 
-    F^-1 (n / (n - p) sum of s_i s_i^T) F^-1    (clusters are the records; Liang and Zeger 1986),
+    C_i = diag(noise^2) + c^2 a_i^2 W_i(h) W_i(h') exp(-(h - h')^2 / (2 l^2))
 
-but in no direction less than F^-1, which it is where there is nothing but the stated noise. Where records are
-fewer than `_MIN_CLUSTERS`, it is F^-1, times the reduced chi-squared if that exceeds one.
+the relative misfit c and the correlation length l, common to all records, have their most likely values, by
+the restricted likelihood. As sums of Gaussians have Gaussian correlation, the second term has low rank, and
+records are whitened by the eigenvectors of a small matrix.
 
-**Source:** Golub and Pereyra (1973), SIAM J. Numer. Anal. 10, 413; Liang and Zeger (1986), Biometrika 73, 13;
-for GEDI's footprints over airborne clouds, Hancock et al. (2019), Earth Space Sci. 6, 294.
+1. Chi-squared of noise alone is evaluated on a grid of shifts.
+2. Gauss-Newton steps, damped by Levenberg and Marquardt, start from its lowest minima.
+3. From each end, c and l are found, and the steps go on with the C_i; so twice. The most likely end is the
+   result.
+
+**Covariance.** With whitened residuals r_i and derivatives J_i, scores s_i = J_i^T r_i and the information F,
+the sum of F_i = J_i^T J_i and of the priors, leaving record i out changes the parameters by d_i = (F -
+F_i)^-1 s_i to first order. The covariance is that of the jackknife over n records,
+
+    (n - 1) / n sum of d_i d_i^T    (CR3; Bell and McCaffrey 2002),
+
+but in no direction less than F^-1, which it would be if the misfit were as modelled. It contains noise, and
+every error of the scene that is independent from record to record, whatever its shape. It does not contain
+errors that all records share, such as a cloud that is itself displaced. Where records are fewer than
+`_MIN_CLUSTERS`, or than twice the parameters, it is F^-1, times the chi-squared of the whitened residuals
+over its degrees of freedom if that exceeds one.
+
+**Source:** Golub and Pereyra (1973), SIAM J. Numer. Anal. 10, 413; Rasmussen and Williams (2006), Gaussian
+Processes for Machine Learning, chapters 2 and 5; Patterson and Thompson (1971), Biometrika 58, 545
+(restricted likelihood); Bell and McCaffrey (2002), Survey Methodology 28, 169; for GEDI's footprints over
+airborne clouds, Hancock et al. (2019), Earth Space Sci. 6, 294.
 """
 
 import dataclasses
@@ -53,6 +76,8 @@ _NODE_COVARIANCE = 0.5
 # Distance of nodes over the standard deviation of the footprint. The largest term that the sum over nodes
 # adds to the integral has the factor exp(-(2 pi / 0.7)^2 / 8) = 4e-5.
 _NODE_SPACING = 0.7
+# Materials whose reflectance is the plants'.
+_PLANTS = ("leaf", "bark")
 # Standard deviations of g within which nodes count: 3e-4 of its integral lie beyond.
 _REACH = 4.0
 # Distance of the shifts that are tried first, over the standard deviation of the footprint: the minimum of
@@ -62,8 +87,14 @@ _COARSE_SPACING = 0.35
 _STARTS, _APART = 3, 3.0
 # Most trial steps from a start; the largest step, in standard errors and in m, that counts as converged.
 _MAX_STEPS, _SMALL_STEP, _SMALLEST_STEP = 40, 0.01, 1e-4
-# Fewest records for which the scatter of their scores is taken for their covariance.
+# Fewest records for which the covariance is that of the jackknife over them.
 _MIN_CLUSTERS = 6
+# Squares of the relative misfit, and correlation lengths, m, whose likelihoods are compared. One step of the
+# first, a third, is less than 8 records tell; lengths a factor of 1.4 apart differ little, too.
+_MISFIT_SQUARES = np.concatenate([[0.0], np.logspace(-4.0, 0.5, 28)])
+_MISFIT_LENGTHS = 0.5 * 2.0 ** (0.5 * np.arange(9))
+# How often the misfit is found anew, and the signal over its maximum below which it is left out.
+_MISFIT_ROUNDS, _FAINT = 2, 1e-3
 # Least information, 1/m2, of which the covariance is the inverse.
 _LEAST_INFORMATION = 1e-12
 
@@ -80,8 +111,13 @@ class Geolocation(NamedTuple):
     - `position`: (shots, 2) m, positions with the shift.
     - `scale`: (shots,) factor by which the simulated waveform is multiplied.
     - `fitted`: (shots, samples), or (shots, wavelengths, samples) as the records: simulated times `scale`.
-    - `chi_squared`: of the fit, over its degrees of freedom. One if there is only the stated noise.
+    - `chi_squared`: of the fit with the stated noise, over its degrees of freedom. One if there is only
+      noise.
     - `status`: "converged", or the reason why the result is not to be used.
+    - `reflectance_ratio`: factor by which plants are brighter, relative to the ground, than in the scene; 1
+      where it was not fitted.
+    - `misfit`: what the scene does not explain of a record, one standard deviation over the fitted waveform.
+    - `misfit_length`: m of height, over which the misfit is correlated.
 
     **Example:** 95 % limits of the shift.
 
@@ -105,6 +141,9 @@ class Geolocation(NamedTuple):
     fitted: Float[np.ndarray, "shots ..."]
     chi_squared: float
     status: str
+    reflectance_ratio: float = 1.0
+    misfit: float = 0.0
+    misfit_length: float = 0.0
 
 
 def geolocate(
@@ -118,15 +157,26 @@ def geolocate(
     search_radius: float = 20.0,
     drift: bool = False,
     height_error: float = 0.0,
+    ratio_error: float = 0.5,
     max_orders: int = 1,
-    rtol: float = 0.05,
+    rtol: float = 0.1,
 ) -> Geolocation:
     """Find where the footprints of a survey fell, over a canopy and terrain that are known.
 
     All records are shifted together. The shift is searched within a radius, then refined by Gauss-Newton
-    steps. Waveforms are compared up to a factor each, so that neither the gain nor the reflectance of a
-    record need be known, only the ratio of that of leaves to that of the ground. Beams must be Gaussian and
-    have one direction, as GEDI's along an orbit.
+    steps. Waveforms are compared up to a factor each, so that the gain of a record need not be known, and up
+    to the ratio of the reflectance of plants to that of the ground, one for all. What else the scene does not
+    explain counts as a relative error of the waveform, correlated over height, whose size is found from the
+    records. Beams must be Gaussian and have one direction, as GEDI's along an orbit.
+
+    Standard errors contain noise and those errors of the scene that are independent from record to record,
+    not those that all records share. With fewer than 6 records, or than twice the unknowns, they take errors
+    of the scene to be as modelled.
+
+    Over canopies from two airborne clouds, with 36 and 35 footprints by the GEDI simulator and a ratio of
+    signal to noise of 20, the shift is within 0.5 m of the truth on each axis. Over random subsets of 8
+    footprints, two standard errors hold in some nine of ten. If noise alone is drawn anew, the error from
+    the scene is the same in every draw, and two standard errors may hold in all draws, or in half of them.
 
     **Arguments:**
 
@@ -144,9 +194,11 @@ def geolocate(
     - `height_error`: m, standard deviation of an offset that the heights of all records have in common, 0 or
       more. It is fitted unless it is 0. Over a slope, an offset that is not fitted looks like a shift.
       Default 0.
+    - `ratio_error`: standard deviation of the natural logarithm of the ratio of the reflectance of plants to
+      that of the ground, about the scene's, 0 or more. It is fitted unless it is 0. Default 0.5.
     - `max_orders`: orders of scattering that are simulated, at least 1. Default 1.
     - `rtol`: relative error of the simulation at each node, in (0, 1); that of a footprint, a sum over some
-      thirty nodes, is smaller. Default 0.05.
+      thirty nodes, is smaller. Default 0.1.
 
     **Returns:** a `Geolocation`.
 
@@ -180,6 +232,7 @@ def geolocate(
     check_number("search_radius", search_radius, 0.0, low_open=True)
     check_kind("drift", drift, bool | np.bool_, "True or False")
     check_number("height_error", height_error, 0.0)
+    check_number("ratio_error", ratio_error, 0.0)
     footprint = _footprint_covariance(survey)
     observed = _observed_records(records, height, noise, survey)
     nodes = _simulate_nodes(
@@ -187,15 +240,19 @@ def geolocate(
     )
     radius = float(search_radius)
     model = _SurveyModel(
-        observed, nodes, survey.position, radius, drift=bool(drift), height_error=float(height_error)
+        observed,
+        nodes,
+        survey.position,
+        radius,
+        drift=bool(drift),
+        height_error=float(height_error),
+        ratio_error=float(ratio_error),
     )
-    best = None
-    for start in _coarse_minima(model, float(search_radius), float(np.sqrt(footprint[0, 0]))):
-        descent = _descend(model, start)
-        if best is None or descent.fit.objective < best.fit.objective:
-            best = descent
-    assert best is not None
-    return _geolocation(model, best, float(search_radius), records)
+    ends = [
+        _descend_with_misfit(model, start)
+        for start in _coarse_minima(model, radius, float(np.sqrt(footprint[0, 0])))
+    ]
+    return _geolocation(min(ends, key=lambda end: end.deviance), model, radius, records)
 
 
 # -- records -----------------------------------------------------------------------------------------------
@@ -305,13 +362,14 @@ def _footprint_covariance(survey: Survey) -> Float[np.ndarray, "2 2"]:
 class _Nodes(NamedTuple):
     """Waveforms of narrow beams at the nodes of a grid.
 
-    - `position`: (nodes, 2) m. - `waveform`: (nodes, wavelengths, times). - `height`: (times,) m, decreasing.
+    - `position`: (nodes, 2) m. - `waveform`: (nodes, 2, wavelengths, times), light from plants and all other.
+    - `height`: (times,) m, decreasing.
     - `precision`: (2, 2) 1/m2, inverse covariance of g, the density that makes a footprint of the nodes.
     - `reach`: m, distance from a footprint within which nodes count. - `spacing`: of the grid, m.
     """
 
     position: Float[np.ndarray, "nodes 2"]
-    waveform: Float[np.ndarray, "nodes wavelengths times"]
+    waveform: Float[np.ndarray, "nodes 2 wavelengths times"]
     height: Float[np.ndarray, " times"]
     precision: Float[np.ndarray, "2 2"]
     reach: float
@@ -346,9 +404,16 @@ def _simulate_nodes(
     with warnings.catch_warnings():
         # Beams at the edge of the map are expected: shifts towards it are tried, too.
         warnings.simplefilter("ignore", OffMapWarning)
-        waves = simulate_many(node_survey, scene, key=key, rtol=rtol, max_orders=max_orders)
+        waves = simulate_many(
+            node_survey, scene, key=key, rtol=rtol, max_orders=max_orders, keep=("reflectance", "components")
+        )
     height = _heights_of(waves.time, np.cos(np.deg2rad(survey.zenith[0])))
-    waveform = np.asarray(waves.reflectance, float)
+    total = np.asarray(waves.reflectance, float)
+    plants = sum(
+        (np.asarray(waves.components[name], float) for name in _PLANTS if name in waves.components),
+        start=np.zeros_like(total),
+    )
+    waveform = np.stack([plants, total - plants], axis=1)
     return _Nodes(position, waveform, height, np.linalg.inv(between), reach, spacing)
 
 
@@ -406,25 +471,57 @@ class _ShotData(NamedTuple):
     row: Float[np.ndarray, " samples"]
 
 
-class _Fit(NamedTuple):
-    """The fit at some parameters.
+class _Whitener(NamedTuple):
+    """The inverse square root of I + V^T diag(variance) V, the covariance of a record over that of its noise.
 
-    - `objective`: chi-squared and the prior. - `information`: (parameters, parameters), J^T J and the prior.
-    - `gradient`: (parameters,), J^T r and the prior's. - `scores`: (shots, parameters), s_i of the module.
-    - `scale`: (shots,) factors a_i.
+    - `vectors`: V, (rank, lit samples), orthonormal rows. - `variance`: (rank,).
+    - `lit`: (lit samples,) their places among the samples of all wavelengths; V is zero elsewhere.
+    """
+
+    vectors: np.ndarray
+    variance: np.ndarray
+    lit: np.ndarray
+
+    def __call__(self, rows: np.ndarray) -> np.ndarray:
+        """Whiten rows (..., wavelengths x samples)."""
+        change = 1.0 / np.sqrt(1.0 + self.variance) - 1.0
+        whitened = rows.copy()
+        whitened[..., self.lit] += ((rows[..., self.lit] @ self.vectors.T) * change) @ self.vectors
+        return whitened
+
+
+class _Misfit(NamedTuple):
+    """What the scene does not explain: its relative size, its correlation length in m, and whiteners."""
+
+    relative: float
+    length: float
+    whiteners: list[_Whitener]
+
+
+class _Fit(NamedTuple):
+    """The fit at some parameters, of whitened residuals.
+
+    - `objective`: chi-squared and the priors. - `information`: (parameters, parameters), J^T J and the
+      priors.
+    - `gradient`: (parameters,), J^T r and the priors'. - `scores`: (shots, parameters), s_i of the module.
+    - `shot_information`: (shots, parameters, parameters), F_i. - `scale`: (shots,) factors a_i.
+    - `deviance`: -2 ln of the restricted likelihood, and the priors.
     """
 
     objective: float
     information: np.ndarray
     gradient: np.ndarray
     scores: np.ndarray
+    shot_information: np.ndarray
     scale: np.ndarray
+    deviance: float
 
 
 class _SurveyModel:
     """Simulated waveforms of all shots as a function of the parameters.
 
-    These are the shift (2), the drift (2) if it is fitted, and the height offset if it is.
+    These are the shift (2), the drift (2) if it is fitted, and the logarithm of the ratio of reflectances and
+    the height offset if they are.
     """
 
     def __init__(
@@ -436,10 +533,20 @@ class _SurveyModel:
         *,
         drift: bool,
         height_error: float,
+        ratio_error: float = 0.0,
     ):
         self.nodes, self.drift, self.height_error = nodes, drift, height_error
         self.position = position
-        self.count = 2 + 2 * drift + (height_error > 0)
+        self.count = 2 + 2 * drift + (ratio_error > 0) + (height_error > 0)
+        # Place of the logarithm of the ratio among the parameters; the height offset is the last one.
+        self.ratio_place = 2 + 2 * drift if ratio_error > 0 else None
+        self.prior_precision = np.zeros(self.count)
+        if self.ratio_place is not None:
+            self.prior_precision[self.ratio_place] = ratio_error**-2
+        if height_error > 0:
+            self.prior_precision[-1] = height_error**-2
+        # All light of the nodes: that of the scene's own ratio.
+        self.total = nodes.waveform.sum(axis=1)
         weights = np.linspace(-0.5, 0.5, len(position))
         self.shots = [
             self._shot(records, shot, float(weights[shot]), search_radius) for shot in range(len(position))
@@ -468,6 +575,10 @@ class _SurveyModel:
         inside = (row >= 0) & (row <= last)
         return np.where(inside, low + (row - index) * (high - low), 0.0)
 
+    def ratio(self, parameters: np.ndarray) -> float:
+        """Return the factor by which plants are brighter than in the scene."""
+        return 1.0 if self.ratio_place is None else float(np.exp(parameters[self.ratio_place]))
+
     def simulated(self, shot: _ShotData, parameters: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the waveform of a shot, (wavelengths, samples), and its derivatives, (parameters, ...)."""
         nodes = self.nodes
@@ -476,7 +587,12 @@ class _SurveyModel:
         g = self._density(offset)
         # g and its derivatives east and north, of all nodes: one product with their waveforms.
         rows = np.stack([g, -slope[:, 0] * g, -slope[:, 1] * g])
-        at_times = np.tensordot(rows, nodes.waveform[shot.nodes], 1)
+        if self.ratio_place is None:
+            at_times, plants = np.tensordot(rows, self.total[shot.nodes], 1), None
+        else:
+            by_material = np.tensordot(rows, nodes.waveform[shot.nodes], 1)
+            plants = self.ratio(parameters) * by_material[0, 0]
+            at_times = self.ratio(parameters) * by_material[:, 0] + by_material[:, 1]
         step = (nodes.height[-1] - nodes.height[0]) / (nodes.height.size - 1)
         # A record whose heights are too low by z shows at h the scene at h + z.
         row = shot.row + (parameters[-1] / step if self.height_error > 0 else 0.0)
@@ -484,6 +600,8 @@ class _SurveyModel:
         columns = list(by_position)
         if self.drift:
             columns += [shot.weight * column for column in by_position]
+        if plants is not None:
+            columns.append(self._at_rows(row, plants))
         if self.height_error > 0:
             columns.append(self._at_rows(row, np.gradient(at_times[0], axis=-1) / step))
         return waveform, np.stack(columns)
@@ -493,44 +611,129 @@ class _SurveyModel:
         norm = self.nodes.spacing**2 * np.sqrt(np.linalg.det(self.nodes.precision)) / (2.0 * np.pi)
         return norm * np.exp(-0.5 * np.einsum("...i,ij,...j", offset, self.nodes.precision, offset))
 
-    def fit(self, parameters: np.ndarray) -> _Fit:
-        """Evaluate the fit, with the factors at their least-squares values."""
+    def fit(self, parameters: np.ndarray, misfit: _Misfit | None = None) -> _Fit:
+        """Evaluate the fit, with the factors at their least-squares values; None: there is noise alone."""
         n = self.count
-        information, gradient, objective = np.zeros((n, n)), np.zeros(n), 0.0
-        scores, scales = [], []
-        for shot in self.shots:
+        information, gradient = np.diag(self.prior_precision), -self.prior_precision * parameters
+        objective = float(self.prior_precision @ parameters**2)
+        determinant, scores, shot_information, scales = 0.0, [], [], []
+        for number, shot in enumerate(self.shots):
             waveform, columns = self.simulated(shot, parameters)
             model, columns = waveform * shot.inverse_noise, columns * shot.inverse_noise
-            square = max(float(np.sum(model * model)), 1e-300)
-            scale = max(float(np.sum(model * shot.power)) / square, 0.0)
-            residual = shot.power - scale * model
+            model, power, columns = model.ravel(), shot.power.ravel(), columns.reshape(n, -1)
+            noise_square = max(float(model @ model), 1e-300)
+            if misfit is not None:
+                whitener = misfit.whiteners[number]
+                model, power, *columns = whitener(np.vstack([model, power, columns]))
+                columns = np.array(columns)
+                determinant += float(np.sum(np.log1p(whitener.variance)))
+            square = max(float(model @ model), 1e-300)
+            # What the factor adds to the restricted likelihood, for a prior that scales with the model.
+            determinant += np.log(square / noise_square)
+            scale = max(float(model @ power) / square, 0.0)
+            residual = power - scale * model
             # Derivatives less their projection on the model, which the factor takes up (Kaufman 1975).
-            columns = columns.reshape(n, -1)
-            columns = scale * (columns - np.outer(columns @ model.ravel() / square, model.ravel()))
-            score = columns @ residual.ravel()
-            objective += float(np.sum(residual**2))
-            information += columns @ columns.T
-            gradient += score
-            scores.append(score)
+            columns = scale * (columns - np.outer(columns @ model / square, model))
+            scores.append(columns @ residual)
+            shot_information.append(columns @ columns.T)
+            objective += float(residual @ residual)
+            gradient = gradient + scores[-1]
+            information = information + shot_information[-1]
             scales.append(scale)
-        if self.height_error > 0:
-            precision = self.height_error**-2
-            objective += precision * parameters[-1] ** 2
-            information[-1, -1] += precision
-            gradient[-1] -= precision * parameters[-1]
-        return _Fit(objective, information, gradient, np.array(scores), np.array(scales))
+        return _Fit(
+            objective,
+            information,
+            gradient,
+            np.array(scores),
+            np.array(shot_information),
+            np.array(scales),
+            objective + determinant,
+        )
+
+    def misfit(self, parameters: np.ndarray, scale: Float[np.ndarray, " shots"]) -> _Misfit:
+        """Find the most likely relative misfit and correlation length, about waveforms times `scale`.
+
+        The restricted likelihood of each record is a sum over the eigenvectors of its misfit, so that all
+        sizes of the misfit are compared at once.
+        """
+        models = [a * self.simulated(shot, parameters)[0] for a, shot in zip(scale, self.shots)]
+        lowest, best = np.inf, (0.0, _MISFIT_LENGTHS[0])
+        for length in _MISFIT_LENGTHS:
+            deviance = np.zeros(len(_MISFIT_SQUARES))
+            for shot, model in zip(self.shots, models):
+                deviance += _misfit_deviance(shot, model, *self._misfit_rows(shot, model, length))
+            place = int(np.argmin(deviance))
+            if deviance[place] < lowest:
+                lowest, best = deviance[place], (float(np.sqrt(_MISFIT_SQUARES[place])), float(length))
+        relative, length = best
+        whiteners = []
+        for shot, model in zip(self.shots, models):
+            rows, lit = self._misfit_rows(shot, model, length)
+            vectors, variance = _principal_axes(rows)
+            whiteners.append(_Whitener(vectors, relative**2 * variance, lit))
+        return _Misfit(relative, length, whiteners)
+
+    def _misfit_rows(
+        self, shot: _ShotData, model: np.ndarray, length: float
+    ) -> tuple[Float[np.ndarray, "rank lit"], Int[np.ndarray, " lit"]]:
+        """Return B, whose B^T B is the covariance of a misfit of unit size, and the samples that are lit.
+
+        It is over that of the noise. A Gaussian process with the correlation length l is a sum of
+        independent Gaussians of the width l / sqrt(2). With the distance l their variance is even to 1.4 %.
+        """
+        total = model.sum(axis=0)
+        (samples,) = np.nonzero(total > _FAINT * max(float(total.max()), 1e-300))
+        wavelengths = len(model)
+        lit = (np.arange(wavelengths)[:, None] * total.size + samples).ravel()
+        if not samples.size:
+            return np.zeros((0, 0)), lit
+        step = (self.nodes.height[-1] - self.nodes.height[0]) / (self.nodes.height.size - 1)
+        height = self.nodes.height[0] + step * shot.row[samples]
+        knots = np.arange(height.min() - length, height.max() + 2.0 * length, length)
+        shapes = (2.0 / np.pi) ** 0.25 * np.exp(-(((height - knots[:, None]) / length) ** 2))
+        # Wavelengths have a misfit each.
+        weighted = (model * shot.inverse_noise)[:, samples]
+        rows = np.einsum("ks,ws,wv->kwvs", shapes, weighted, np.eye(wavelengths))
+        return rows.reshape(-1, lit.size), lit
 
     def chi_squared_of_shifts(self, shifts: Float[np.ndarray, "shifts 2"]) -> Float[np.ndarray, " shifts"]:
         """Return chi-squared for many shifts, without drift and height offset."""
         total = np.zeros(len(shifts))
         for shot in self.shots:
             offset = shot.place + shifts[:, None] - self.nodes.position[shot.nodes]
-            at_times = np.tensordot(self._density(offset), self.nodes.waveform[shot.nodes], 1)
+            at_times = np.tensordot(self._density(offset), self.total[shot.nodes], 1)
             model = (self._at_rows(shot.row, at_times) * shot.inverse_noise).reshape(len(shifts), -1)
             square = np.maximum(np.sum(model * model, axis=1), 1e-300)
             overlap = np.maximum(model @ shot.power.ravel(), 0.0)
             total += np.sum(shot.power**2) - overlap**2 / square
         return total
+
+
+def _principal_axes(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the eigenvectors, as rows, and the eigenvalues above rounding of B^T B, of rows B."""
+    variance, axes = np.linalg.eigh(rows @ rows.T)
+    positive = variance > 1e-9 * max(float(variance.max(initial=0.0)), 1e-9)
+    return (axes[:, positive].T @ rows) / np.sqrt(variance[positive, None]), variance[positive]
+
+
+def _misfit_deviance(
+    shot: _ShotData,
+    model: np.ndarray,
+    rows: Float[np.ndarray, "rank lit"],
+    lit: Int[np.ndarray, " lit"],
+) -> Float[np.ndarray, " sizes"]:
+    """Return -2 ln of the restricted likelihood of a record, for all sizes of the misfit with rows B."""
+    vectors, variance = _principal_axes(rows)
+    expected, power = (model * shot.inverse_noise).ravel(), shot.power.ravel()
+    variances = _MISFIT_SQUARES[:, None] * variance
+    # Products with the inverse of the covariance differ from plain ones by what lies along the eigenvectors.
+    change = 1.0 / (1.0 + variances) - 1.0
+    along, power_along = vectors @ expected[lit], vectors @ power[lit]
+    plain_square = max(float(expected @ expected), 1e-300)
+    square = np.maximum(plain_square + change @ along**2, 1e-12 * plain_square)
+    overlap = np.maximum(expected @ power + change @ (along * power_along), 0.0)
+    chi_squared = power @ power + change @ power_along**2 - overlap**2 / square
+    return chi_squared + np.log1p(variances).sum(axis=1) + np.log(square / plain_square)
 
 
 # -- fit ---------------------------------------------------------------------------------------------------
@@ -551,60 +754,78 @@ def _coarse_minima(model: _SurveyModel, search_radius: float, sigma: float) -> I
 
 
 class _Descent(NamedTuple):
-    """The end of a descent: parameters, the fit there, and whether it converged."""
+    """The end of a descent: parameters, the fit and the misfit there, and whether it converged."""
 
     parameters: np.ndarray
     fit: _Fit
+    misfit: _Misfit | None
     converged: bool
 
+    @property
+    def deviance(self) -> float:
+        """-2 ln of the restricted likelihood, and the priors."""
+        return self.fit.deviance
 
-def _descend(model: _SurveyModel, parameters: np.ndarray) -> _Descent:
+
+def _descend_with_misfit(model: _SurveyModel, parameters: np.ndarray) -> _Descent:
+    """Descend with noise alone, then with the misfit that is most likely at the end, and so again."""
+    end = _descend(model, parameters)
+    for _ in range(_MISFIT_ROUNDS):
+        end = _descend(model, end.parameters, model.misfit(end.parameters, end.fit.scale))
+    return end
+
+
+def _descend(model: _SurveyModel, parameters: np.ndarray, misfit: _Misfit | None = None) -> _Descent:
     """Minimise the objective by Gauss-Newton steps, damped by Levenberg and Marquardt."""
-    fit, damping = model.fit(parameters), 1e-3
+    fit, damping = model.fit(parameters, misfit), 1e-3
     for _ in range(_MAX_STEPS):
         diagonal = np.diag(fit.information) + 1e-30
         step = np.linalg.solve(fit.information + damping * np.diag(diagonal), fit.gradient)
-        trial = model.fit(parameters + step)
+        trial = model.fit(parameters + step, misfit)
         if trial.objective <= fit.objective:
             parameters, fit, damping = parameters + step, trial, 0.1 * damping
             if np.all(np.abs(step) < np.maximum(_SMALL_STEP / np.sqrt(diagonal), _SMALLEST_STEP)):
-                return _Descent(parameters, fit, True)
+                return _Descent(parameters, fit, misfit, True)
         else:
             damping *= 10.0
-    return _Descent(parameters, fit, False)
+    return _Descent(parameters, fit, misfit, False)
 
 
-def _robust_covariance(information: np.ndarray, scores: np.ndarray) -> np.ndarray:
-    """Return the covariance by the scatter of the records' scores, and nowhere less than by their noise.
+def _jackknife_covariance(fit: _Fit) -> np.ndarray:
+    """Return the covariance by the jackknife over records, and nowhere less than by the information.
 
-    With few records the scatter is often too small by chance. In coordinates in which the information is the
-    unit matrix, its eigenvalues would be one if there were only the stated noise; smaller ones are raised.
+    With few records the first is often too small by chance. In coordinates in which the information is the
+    unit matrix, its eigenvalues would be one if noise and misfit were as modelled; smaller ones are raised.
     """
-    shots, n = scores.shape
-    eigenvalues, axes = np.linalg.eigh(information)
-    root = axes / np.sqrt(np.maximum(eigenvalues, _LEAST_INFORMATION))
-    scatter = shots / (shots - n) * root.T @ scores.T @ scores @ root
-    ratios, directions = np.linalg.eigh(scatter)
-    root = root @ directions
+    shots, n = fit.scores.shape
+    # The floor keeps finite, and huge, what a single record tells.
+    remaining = fit.information - fit.shot_information + _LEAST_INFORMATION * np.eye(n)
+    changes = np.linalg.solve(remaining, fit.scores[:, :, None])[:, :, 0]
+    jackknife = (shots - 1) / shots * changes.T @ changes
+    eigenvalues, axes = np.linalg.eigh(fit.information)
+    spread = np.sqrt(np.maximum(eigenvalues, _LEAST_INFORMATION))
+    ratios, directions = np.linalg.eigh((axes * spread).T @ jackknife @ (axes * spread))
+    root = (axes / spread) @ directions
     return root @ np.diag(np.maximum(ratios, 1.0)) @ root.T
 
 
 def _geolocation(
-    model: _SurveyModel, descent: _Descent, search_radius: float, records: object
+    descent: _Descent, model: _SurveyModel, search_radius: float, records: object
 ) -> Geolocation:
     """Return the result of the best descent, with the covariance of its parameters."""
-    parameters, fit, converged = descent
+    parameters, fit, misfit, converged = descent
     shots, n = fit.scores.shape
     samples = sum(int(np.sum(shot.inverse_noise > 0)) for shot in model.shots)
-    chi_squared = fit.objective / max(samples - shots - n, 1)
+    freedom = max(samples - shots - n, 1)
     # A scene that looks the same everywhere tells nothing: the floor keeps its covariance finite, and huge.
     eigenvalues, axes = np.linalg.eigh(fit.information)
     inverse = axes @ np.diag(1.0 / np.maximum(eigenvalues, _LEAST_INFORMATION)) @ axes.T
-    is_determined = eigenvalues[0] * search_radius**2 > 1.0
+    shifts_end = 4 if model.drift else 2
+    is_determined = np.linalg.eigvalsh(inverse[:shifts_end, :shifts_end])[-1] < search_radius**2
     if is_determined and shots >= max(_MIN_CLUSTERS, 2 * n):
-        covariance = _robust_covariance(fit.information, fit.scores)
+        covariance = _jackknife_covariance(fit)
     else:
-        covariance = max(chi_squared, 1.0) * inverse
+        covariance = max(fit.objective / freedom, 1.0) * inverse
     status = "converged" if converged else f"no convergence in {_MAX_STEPS} steps"
     if np.hypot(*parameters[:2]) > search_radius:
         status = "the shift lies beyond the search radius"
@@ -621,6 +842,9 @@ def _geolocation(
         position=model.position + shifts,
         scale=fit.scale,
         fitted=fitted if isinstance(records, Waveforms) else fitted[:, 0],
-        chi_squared=chi_squared,
+        chi_squared=model.fit(parameters).objective / freedom,
         status=status,
+        reflectance_ratio=model.ratio(parameters),
+        misfit=0.0 if misfit is None else misfit.relative,
+        misfit_length=0.0 if misfit is None else misfit.length,
     )
