@@ -17,8 +17,15 @@ so that half of it counts:
     m_f,cell = |sum of e| + 1/2 (sum of |e| - |sum of e|),    e = (spline - irradiance) x area of a point
              = 1/2 (|sum of e| + sum of |e|)
 
-If places one cell apart return independent waveforms, the relative error of f's waveform is the root of the
-sum of m_f,cell^2 over cells. The grid is the coarsest one that keeps this below a tolerance.
+If places one cell apart return independent waveforms, which vary by as much as their mean, the relative error
+of f's waveform is the root of the sum of m_f,cell^2 over cells. The grid is the coarsest one that keeps this
+below a tolerance.
+
+This is an estimate of the worst case, not a standard deviation. Crowns and ground are wider than a cell:
+neighbouring cells return nearly the same, surplus and deficit cancel, and the error is smaller, the more so
+the less returns vary. It is larger only where a few cells return nearly all light. Returns of single nodes do
+not tell by how much: they are means over four spacings, and the error is what the grid does not resolve of
+the scene.
 """
 
 from typing import NamedTuple

@@ -21,7 +21,8 @@ everywhere.
 
       W_f = sum_n c_fn W_n,    Var W_f = sum_n c_fn^2 Var W_n + sum_n (m_fn W_n)^2
 
-  where the last term is the error of the grid: the energy m_fn that the spline misplaces about the node.
+  where the last term is the error of the grid: the energy m_fn that the spline misplaces about the node. It
+  is an estimate of the worst case: where it dominates, as of top hats, standard errors are mostly too large.
 - *By shot.* Otherwise I_f(a) / p(a) V_f(b) = d^2 I_f(a) V_f(b) is computed for each path and each shot that
   may see it (`jaxlidar.survey.view_geometry`), without any error of the grid. Responses are tallied by shot.
   The first order is traced for each shot alone: a lattice of its own rays has less variance than rays that it

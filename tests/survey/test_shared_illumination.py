@@ -7,6 +7,7 @@ import jaxlidar as jl
 from jaxlidar.survey.footprint_splines import BeamSection, fit_footprints, section_of, spline_error
 from jaxlidar.survey.results import OPTIONAL_ARRAYS
 from jaxlidar.survey.shared_illumination import GroupContribution, make_group_context, sum_contributions
+from jaxlidar.trace.entry_nodes import cubic_bspline
 from tests.survey.test_simulate_many import (
     FAST,
     KEY,
@@ -129,6 +130,56 @@ def test_splines_fit_footprints():
         along = splines.coefficients.sum(axis=2 - axis)
         mean = splines.spacing * (splines.first_node[:, axis] + (along * number).sum(axis=1))
         assert np.allclose(mean, survey.position[:, axis], atol=1e-2)
+
+
+def misplaced_light(transmittances, size):
+    """Return errors of top hats above columns with these transmittances, and the estimates of the errors.
+
+    Relative to the light that passes in the mean. There is no Monte Carlo error: the light of nodes is
+    integrated on a raster. `transmittances`: (n, n). `size`: of columns, m.
+    """
+    survey = nadir(16, profile="top-hat")
+    splines = fit_footprints(survey, 0.006)
+    # Twelve raster cells per spacing of the grid resolve splines, edges of columns, and the beam's edge.
+    cell = splines.spacing / 12.0
+    extent = 0.5 * size * len(transmittances)
+    raster = np.arange(-extent + 0.5 * cell, extent, cell)
+    column = np.minimum(((raster + extent) / size).astype(int), len(transmittances) - 1)
+    light = transmittances[np.ix_(column, column)]
+    nodes = np.arange(splines.coefficients.shape[1])
+    errors, estimates = [], []
+    for (x, y), first, coefficients, misplaced in zip(
+        survey.position, splines.first_node, splines.coefficients, splines.misplaced_energy
+    ):
+        along_x, along_y = (
+            cubic_bspline(raster[:, None] / splines.spacing - (first[k] + nodes)) / 12.0 for k in (0, 1)
+        )
+        returned = along_x.T @ light @ along_y
+        distance = np.hypot(raster[:, None] - x, raster[None, :] - y)
+        beam = np.clip(0.5 + (5.0 - distance) / cell, 0.0, 1.0)
+        errors.append(np.sum(coefficients * returned) - np.sum(beam * light) / np.sum(beam))
+        estimates.append(np.sqrt(np.sum((misplaced * returned) ** 2)))
+    return np.array(errors) / transmittances.mean(), np.array(estimates) / transmittances.mean()
+
+
+@pytest.mark.parametrize("size", [0.5, 2.0])
+def test_the_error_of_the_grid_is_estimated_from_above(size):
+    """Root mean square error over the estimate, for columns smaller and larger than the grid's spacing.
+
+    Where half of the columns let light pass and half do not, it is between a quarter and 1; where they differ
+    by a fifth, a fraction of that. Of columns of 0.5 m of which one in twenty returns light, it is above 1.
+    """
+    random, number = np.random.default_rng(4), int(44.0 / size)
+    halves = random.permutation(np.arange(number**2) % 2).reshape(number, number)
+    few = random.uniform(size=(number, number)) < 0.05
+
+    def ratio(transmittances):
+        errors, estimates = misplaced_light(transmittances.astype(float), size)
+        return np.sqrt(np.mean(errors**2) / np.mean(estimates**2))
+
+    assert 0.25 < ratio(halves) < 1.0
+    assert ratio(0.8 + 0.2 * halves) < 0.15
+    assert size > 1.0 or ratio(few) > 1.0
 
 
 @pytest.mark.slow

@@ -17,8 +17,9 @@ import pytest
 
 import jaxlidar as jl
 from jaxlidar.sampling.adaptive import StopReason
-from jaxlidar.survey import coverage
+from jaxlidar.survey import choose_strategy, coverage
 from jaxlidar.survey.coverage import ground_heights, off_map
+from jaxlidar.survey.footprint_splines import fit_footprints
 from tests.quick_compilation import optimise_programs
 
 KEY = jax.random.key(5)
@@ -80,12 +81,15 @@ def deviations(waveforms, waves, wavelength=slice(None)):
     return np.concatenate(scores)
 
 
-def agree(z):
-    """Return True if z-tests of all samples, at a level of 1 % together, and chi-squared of all pass."""
+def agree(z, least=0.5):
+    """Return True if z-tests of all samples, at a level of 1 % together, and chi-squared of all pass.
+
+    `least`: smallest admissible mean of z^2; smaller values tell that standard errors are too large.
+    """
     # 2.6 is the normal quantile of 1 %; by Sidak the worst of n has that of 1 % / n.
     worst = np.sqrt(2 * np.log(z.size / 0.01))
     # Standard errors are widened for few batches: on average by a tenth or two.
-    return np.all(np.abs(z) < worst) and 0.5 < np.mean(z**2) < 1.0 + 4.0 * np.sqrt(2.0 / z.size)
+    return np.all(np.abs(z) < worst) and least < np.mean(z**2) < 1.0 + 4.0 * np.sqrt(2.0 / z.size)
 
 
 def same(a, b):
@@ -114,24 +118,38 @@ def oblique_and_limited(count):
     return oblique(count, field_of_view=0.4)
 
 
-@pytest.mark.parametrize(
-    ("shots", "orders"),
-    [(6, 1), pytest.param(6, 2, marks=pytest.mark.slow), pytest.param(50, 2, marks=pytest.mark.slow)],
-)
-@pytest.mark.parametrize(
-    ("kind", "shared"),
-    [
-        (nadir, True),
-        pytest.param(nadir, False, marks=pytest.mark.slow),
-        pytest.param(top_hats, True, marks=pytest.mark.slow),
-        pytest.param(limited, True, marks=pytest.mark.slow),
-        pytest.param(oblique, True, marks=pytest.mark.slow),
-        pytest.param(oblique_and_limited, True, marks=pytest.mark.slow),
-        pytest.param(scan, False, marks=pytest.mark.slow),
-    ],
-)
+# Kinds of shots, and whether they share light.
+KINDS = [
+    (nadir, True),
+    (nadir, False),
+    (top_hats, True),
+    (limited, True),
+    (oblique, True),
+    (oblique_and_limited, True),
+    (scan, False),
+]
+# Combinations that are tested elsewhere: the first order of top hats below, and in
+# `tests.survey.test_shared_illumination` that oblique and limited shots cannot share it.
+EXCLUDED = [(kind, 1) for kind in (top_hats, limited, oblique, oblique_and_limited)]
+SLOW_CASES = [
+    pytest.param(kind, shared, shots, orders, marks=pytest.mark.slow)
+    for kind, shared in KINDS
+    for shots, orders in ((6, 1), (6, 2), (50, 2))
+    if (kind, orders) not in EXCLUDED and (kind, shared, shots, orders) != (nadir, True, 6, 1)
+]
+
+
+@pytest.mark.parametrize(("kind", "shared", "shots", "orders"), [(nadir, True, 6, 1), *SLOW_CASES])
 def test_shots_agree_with_single_simulations(kind, shared, shots, orders):
-    survey, scene, options = kind(shots), stand(), {"rtol": 0.03, "max_orders": orders}
+    check_agreement(kind(shots), shared=shared, orders=orders)
+
+
+def check_agreement(survey, *, shared, orders, least=0.5):
+    """Check shots of a survey against single simulations; return both.
+
+    `least`: as in `agree`.
+    """
+    scene, options = stand(), {"rtol": 0.03, "max_orders": orders}
     waves = simulate_each(survey, scene, **options)
     options |= {"shared": shared}
     waveforms = jl.simulate_many(survey, scene, key=KEY, **options)
@@ -139,12 +157,37 @@ def test_shots_agree_with_single_simulations(kind, shared, shots, orders):
     assert np.array_equal(waveforms.time, waves[0].time)
     assert np.all(waveforms.error <= 0.03)
     z = deviations(waveforms, waves)
-    assert z.size > 5 * shots
-    assert agree(z)
+    assert z.size > 5 * len(survey)
+    assert agree(z, least)
     # Planted: each shot 2 m further, and leaves that are a tenth darker.
-    assert not agree(deviations(jl.simulate_many(survey, stand(0.4), key=KEY, **options), waves))
+    assert not agree(deviations(jl.simulate_many(survey, stand(0.4), key=KEY, **options), waves), least)
     shifted = jl.Survey(survey.lidar, survey.position + np.array([2.0, 0.0]), survey.zenith, survey.azimuth)
-    assert not agree(deviations(jl.simulate_many(shifted, scene, key=KEY, **options), waves))
+    assert not agree(deviations(jl.simulate_many(shifted, scene, key=KEY, **options), waves), least)
+    return waveforms, waves
+
+
+@pytest.mark.slow
+def test_top_hats_agree_at_first_order_within_the_error_of_the_grid(monkeypatch):
+    """Splines do not fit the edge of a top hat: at first order most of its error is that of the grid.
+
+    That part is an upper estimate for scenes like this one (`jaxlidar.survey.footprint_splines`), so that the
+    mean of z^2 may be small. The random part is compared without it: it is too large by no more than that of
+    others.
+    """
+    survey = top_hats(6)
+    waveforms, waves = check_agreement(survey, shared=True, orders=1, least=0.0)
+
+    def fit_without_error(*arguments):
+        splines = fit_footprints(*arguments)
+        return splines._replace(misplaced_energy=np.zeros_like(splines.misplaced_energy))
+
+    monkeypatch.setattr(choose_strategy, "fit_footprints", fit_without_error)
+    random_part = jl.simulate_many(survey, stand(), key=KEY, rtol=0.03, max_orders=1, shared=True)
+    assert np.array_equal(random_part.reflectance, waveforms.reflectance)
+    assert np.mean(deviations(random_part, waves) ** 2) > 0.5
+    # Planted: random errors that are three times as large.
+    tripled = dataclasses.replace(random_part, stderr=3.0 * random_part.stderr)
+    assert np.mean(deviations(tripled, waves) ** 2) < 0.5
 
 
 @pytest.mark.slow
