@@ -1,6 +1,5 @@
 """Surveys on several devices of one process: XLA makes them of the host's processor."""
 
-import os
 import subprocess
 import sys
 from pathlib import Path
@@ -11,6 +10,7 @@ import pytest
 import jaxlidar as jl
 from tests.survey.test_simulate_many import FAST, KEY, nadir, stand
 
+REPOSITORY = Path(__file__).resolve().parents[2]
 # Surveys, how they are simulated, and how many devices have work to do.
 SURVEYS = {
     "per shot": (nadir(32), FAST | {"shared": False}, 4),
@@ -20,6 +20,12 @@ ON_FOUR_DEVICES = """
 import sys
 
 import jax
+
+jax.config.update("jax_num_cpu_devices", 4)
+from tests.quick_compilation import optimise_programs
+
+# As in the process that compares: options of the compiler change the last bits of results.
+optimise_programs()
 
 import jaxlidar as jl
 from jaxlidar.survey import per_shot, shared_illumination
@@ -52,14 +58,7 @@ for name, (survey, options, n_busy) in SURVEYS.items():
 
 @pytest.mark.slow
 def test_devices_of_a_mesh_trace_the_same_waveforms(tmp_path):
-    folder = Path(__file__).parent
-    environment = {
-        "XLA_FLAGS": "--xla_force_host_platform_device_count=4",
-        "PYTHONPATH": os.pathsep.join([str(folder), str(folder.parent)]),
-    }
-    subprocess.run(
-        [sys.executable, "-c", ON_FOUR_DEVICES, str(tmp_path)], check=True, env=os.environ | environment
-    )
+    subprocess.run([sys.executable, "-c", ON_FOUR_DEVICES, str(tmp_path)], check=True, cwd=REPOSITORY)
     for name, (survey, options, _) in SURVEYS.items():
         on_one = jl.simulate_many(survey, stand(), key=KEY, **options)
         on_four = jl.Waveforms.open(tmp_path / f"{name}.nc")
