@@ -49,6 +49,7 @@ from inversion.fit.design_trace import DivergenceNodes, TracedScene, refine_node
 from inversion.fit.identifiability import CramerRao
 from inversion.fit.planning import N_BATCHES
 from inversion.fit.unknowns import (
+    BoundUnknown,
     Setter,
     Unknown,
     bind_unknowns,
@@ -60,7 +61,7 @@ from inversion.fit.unknowns import (
 from jaxlidar import Lidar, Plan, Response, Scene
 from jaxlidar.extend import as_numpy, check_integer, check_key, check_kind, check_kinds, check_range
 from jaxlidar.planning.effects import effects_of_family
-from jaxlidar.planning.scene_family import plan_cases
+from jaxlidar.planning.scene_family import check_scenes, plan_cases
 
 # Fields of a lidar that can be free: those that act after the trace, of which `inversion.fit.unknowns` names
 # those that records determine, and the divergence, which is interpolated.
@@ -149,6 +150,18 @@ class FreeValues(NamedTuple):
             locate_lidar_array(path, lidar, _ADMISSIBLE_FIELDS, argument="free")[1] for path in self.paths
         ]
 
+    def flat_of(self, lidar: Lidar) -> Float[np.ndarray, " n"]:
+        """Return the free values of a lidar as one vector."""
+        return np.concatenate([np.ravel(np.asarray(value, float)) for value in self.of(lidar)])
+
+    def fraction_of(self, flat: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+        """Return values as fractions of the way from their lower to their upper bounds."""
+        return (flat - self.low) / (self.high - self.low)
+
+    def at_fraction(self, fraction: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+        """Return the values at these fractions of the way from their lower to their upper bounds."""
+        return self.low + fraction * (self.high - self.low)
+
     def lidar_with(self, lidar: Lidar, flat: Array) -> Lidar:
         """Return the lidar with these values; wavelengths are put in order."""
         # Which wavelength is the first does not matter: the noise is that of the record.
@@ -162,6 +175,188 @@ class FreeValues(NamedTuple):
         """Return True for the elements of the flat vectors that are values of a path."""
         sizes = [int(np.prod(shape)) for shape in self.shapes]
         return np.repeat(np.array(self.paths) == path, sizes)
+
+
+@final
+class _SceneTracer(eqx.Module):
+    """Traces the scenes of a design, with the same random numbers for every lidar.
+
+    - `scenes`, `unknowns`: of each scene its unknowns. - `plan`: for all. - `n_samples`: as of `TracedScene`.
+    """
+
+    scenes: list[Scene]
+    unknowns: list[list[BoundUnknown]]
+    plan: Plan
+    n_samples: int | None
+    key: PRNGKeyArray
+
+    def trace(self, lidar: Lidar, nodes: DivergenceNodes | None = None) -> list[TracedScene]:
+        """Trace each scene by a lidar: at its own divergence (None), or at those of nodes."""
+        return [
+            trace_for_design(
+                lidar, scene, self.plan, unknowns, self.key, n_samples=self.n_samples, nodes=nodes
+            )
+            for scene, unknowns in zip(self.scenes, self.unknowns)
+        ]
+
+    def refine(self, traced_scenes: list[TracedScene]) -> list[TracedScene]:
+        """Trace each scene at one more divergence between every two nodes."""
+        return [refine_nodes(traced, self.key) for traced in traced_scenes]
+
+
+@final
+class _DesignProblem(eqx.Module):
+    """The cost of a lidar as a function of its free values, and its minimisation.
+
+    Methods take the traced scenes, since these are other ones once divergences are traced between closer
+    limits. Free values are a flat vector in their own units, or, for the optimiser, fractions of the way from
+    their lower to their upper bounds.
+
+    - `lidar`: with the values that are not free.
+    - `free_values`: their places in the lidar and their bounds.
+    - `noises`: of each scene, an array or a function, as of `design`.
+    - `names`, `shapes`, `labels`: of the unknowns. - `cost_of_bound`: as the argument `cost` of `design`.
+    - `max_steps`: of the optimiser.
+    - `compiled_bound`, `compiled_cost_and_slopes`: the methods of these names as compiled programs.
+    """
+
+    lidar: Lidar
+    free_values: FreeValues
+    noises: list[Any]
+    names: tuple[str, ...]
+    shapes: tuple[tuple[int, ...], ...]
+    labels: tuple[str, ...]
+    cost_of_bound: Cost
+    max_steps: int
+    compiled_bound: Callable[[Array, TracedScene, Any], CramerRao] = eqx.field(init=False)
+    compiled_cost_and_slopes: Callable[[Array, TracedScene, Any], tuple[Array, Array]] = eqx.field(init=False)
+
+    def __post_init__(self) -> None:
+        # By closures, not as compiled methods: the lidar and the limits are constants of the programs, where
+        # those of an object would be arguments of each of hundreds of calls.
+        self.compiled_bound = eqx.filter_jit(lambda *arguments: self.bound(*arguments))
+        self.compiled_cost_and_slopes = eqx.filter_jit(lambda *arguments: self.cost_and_slopes(*arguments))
+
+    def bound(self, flat: Array, traced: TracedScene, noise: Any) -> CramerRao:
+        """Return the bound of one scene."""
+        lidar = self.free_values.lidar_with(self.lidar, flat)
+        return _cramer_rao(lidar, traced, noise, self.names, self.shapes, self.labels)
+
+    def bounds(self, flat: np.ndarray, traced_scenes: list[TracedScene]) -> tuple[CramerRao, ...]:
+        """Return the bounds of all scenes."""
+        return tuple(
+            self.compiled_bound(jnp.asarray(flat), *pair) for pair in zip(traced_scenes, self.noises)
+        )
+
+    def scene_cost(self, flat: Array, traced: TracedScene, noise: Any) -> Array:
+        """Return the cost of one scene."""
+        return jnp.asarray(self.cost_of_bound(self.compiled_bound(flat, traced, noise))).reshape(())
+
+    def cost_and_slopes(self, fraction: Array, traced: TracedScene, noise: Any) -> tuple[Array, Array]:
+        """Return the cost of one scene, and its gradient by fractions."""
+
+        def cost_at(fraction: Array) -> Array:
+            low, high = jnp.asarray(self.free_values.low), jnp.asarray(self.free_values.high)
+            return self.scene_cost(low + fraction * (high - low), traced, noise)
+
+        return jax.value_and_grad(cost_at)(fraction)
+
+    def mean_cost(self, flat: np.ndarray, traced_scenes: list[TracedScene]) -> float:
+        """Return the mean cost over scenes."""
+        pairs = zip(traced_scenes, self.noises)
+        return float(np.mean([float(self.scene_cost(jnp.asarray(flat), *pair)) for pair in pairs]))
+
+    def log_mean_cost(
+        self, fraction: np.ndarray, traced_scenes: list[TracedScene]
+    ) -> tuple[float, np.ndarray]:
+        """Return the logarithm of the mean cost over scenes, and its gradient by fractions."""
+        pairs = zip(traced_scenes, self.noises)
+        terms = [self.compiled_cost_and_slopes(jnp.asarray(fraction), *pair) for pair in pairs]
+        mean = float(np.mean([float(value) for value, _ in terms]))
+        slopes = np.mean([np.asarray(slope, float) for _, slope in terms], axis=0)
+        # The bounds are infinite where an unknown leaves no trace in the record. The line search of the
+        # optimiser steps back from a large number, but not from infinity.
+        if not (np.isfinite(mean) and mean > 0 and np.all(np.isfinite(slopes))):
+            return _REJECTED_COST, np.zeros_like(fraction)
+        # Variances span orders of magnitude over the limits: their logarithm has even steps.
+        return float(np.log(mean)), slopes / mean
+
+    def minimise(
+        self, fraction: np.ndarray, traced_scenes: list[TracedScene], lower: np.ndarray, upper: np.ndarray
+    ) -> Any:
+        """Minimise the logarithm of the mean cost from a start, between fractions of the limits."""
+        return optimize.minimize(
+            self.log_mean_cost,
+            fraction,
+            args=(traced_scenes,),
+            jac=True,
+            method="L-BFGS-B",
+            bounds=np.stack([lower, upper], axis=1),
+            options={"maxiter": self.max_steps},
+        )
+
+    def limits_near(
+        self, flat: np.ndarray, lower: np.ndarray, upper: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return fractions as limits, those of the divergence within `_NEAR_BEST` of its value."""
+        near_low, near_high = (
+            np.clip(self.free_values.fraction_of(flat * factor), 0.0, 1.0)
+            for factor in (1.0 / _NEAR_BEST, _NEAR_BEST)
+        )
+        is_divergence = self.free_values.is_value_of("divergence")
+        return np.where(is_divergence, near_low, lower), np.where(is_divergence, near_high, upper)
+
+    def trace_divergences(
+        self, tracer: _SceneTracer, lower: np.ndarray, upper: np.ndarray, flat: np.ndarray, tolerance: float
+    ) -> list[TracedScene]:
+        """Trace divergences between fractions of the limits, until the cost is known between them.
+
+        The error is that at each new node, of the interpolation between those before.
+
+        `flat`: values of all free variables; that of the divergence is not used.
+
+        **Warns:** UserWarning where the tolerance is not met with `_MAX_NODES` divergences.
+        """
+        is_divergence = self.free_values.is_value_of("divergence")
+        low, high = (self.free_values.at_fraction(end)[is_divergence] for end in (lower, upper))
+        nodes: Any = DivergenceNodes(float(low[0]), float(high[0]), _FIRST_NODES)
+        traced_scenes = tracer.trace(self.lidar, nodes)
+        while True:
+            refined_scenes = tracer.refine(traced_scenes)
+            nodes = refined_scenes[0].nodes
+            candidates = [np.where(is_divergence, new, flat) for new in nodes.divergences[1::2]]
+            interpolated, exact = (
+                np.array([self.mean_cost(candidate, scenes) for candidate in candidates])
+                for scenes in (traced_scenes, refined_scenes)
+            )
+            error, traced_scenes = _interpolation_error(interpolated, exact), refined_scenes
+            if error < tolerance:
+                return traced_scenes
+            if nodes.count >= _MAX_NODES:
+                warnings.warn(
+                    f"the cost between the {nodes.count} divergences that were traced is known to "
+                    f"{error:.1%} only: the divergence found may not be the best; narrower limits, or more "
+                    "rays or photons, help",
+                    # One more than the calls: Equinox puts a call of its own around methods.
+                    stacklevel=4,
+                )
+                return traced_scenes
+
+
+def _interpolation_error(
+    interpolated: Float[np.ndarray, " nodes"], exact: Float[np.ndarray, " nodes"]
+) -> float:
+    """Return the largest relative error of interpolated costs.
+
+    It counts where the cost is not far above the lowest one: elsewhere, divergences that tell little have
+    large relative errors.
+    """
+    # Not finite where no record determines an unknown: no design has such a divergence.
+    lowest = np.fmin(interpolated, exact)
+    is_near = lowest < _NEAR_LOWEST * np.min(exact[np.isfinite(exact)], initial=np.inf)
+    errors = np.abs(interpolated[is_near] / exact[is_near] - 1.0)
+    errors = np.where(np.isfinite(errors), errors, np.inf)
+    return float(np.max(errors, initial=0.0))
 
 
 def design(
@@ -243,7 +438,9 @@ def design(
     >>> print(500 < best.values["wavelength"][0] < 760, best.cost < 0.5 * best.initial_cost)
     True True
     """
-    scenes = [scenes] if isinstance(scenes, Scene) else list(_checked_scenes(scenes))
+    scenes = (
+        [scenes] if isinstance(scenes, Scene) else check_scenes(scenes, "a Scene, or a sequence of Scene")
+    )
     for scene in scenes:
         check_kinds(lidar, scene)
     key = jax.random.key(0) if key is None else key
@@ -257,176 +454,61 @@ def design(
     if "wavelength" in free_values.paths:
         _check_wavelengths_act_late(scenes)
     plan = _plan(lidar, scenes, free_values, max_orders, n_photons, n_rays)
-    n_samples = _number_of_samples(plan, free_values)
     photon_key, start_key = jax.random.split(key)
+    tracer = _SceneTracer(scenes, bound_unknowns, plan, _number_of_samples(plan, free_values), photon_key)
+    traced_scenes = tracer.trace(lidar)
+    problem = _DesignProblem(
+        lidar,
+        free_values,
+        noises=[noise if callable(noise) else _noise_of_samples(noise, t, plan) for t in traced_scenes],
+        names=tuple(unknown.name for unknown in bound_unknowns[0]),
+        shapes=tuple(unknown.start.shape for unknown in bound_unknowns[0]),
+        labels=flat_labels(bound_unknowns[0]),
+        cost_of_bound=_relative_variance(traced_scenes[0].width) if cost is None else cost,
+        max_steps=max_steps,
+    )
+    start = free_values.flat_of(lidar)
+    initial_cost = problem.mean_cost(start, traced_scenes)
 
-    def trace(lidar: Lidar, nodes: DivergenceNodes | None) -> list[TracedScene]:
-        return [
-            trace_for_design(lidar, scene, plan, bound, photon_key, n_samples=n_samples, nodes=nodes)
-            for scene, bound in zip(scenes, bound_unknowns)
-        ]
-
-    traced_scenes = trace(lidar, None)
-    noises = [
-        noise if callable(noise) else _noise_of_samples(noise, traced, plan) for traced in traced_scenes
-    ]
-    names = tuple(unknown.name for unknown in bound_unknowns[0])
-    shapes = tuple(unknown.start.shape for unknown in bound_unknowns[0])
-    labels = flat_labels(bound_unknowns[0])
-    cost_of_bound = _relative_variance(traced_scenes[0].width) if cost is None else cost
-
-    @eqx.filter_jit
-    def bound_of(flat: Array, traced: TracedScene, scene_noise: Any) -> CramerRao:
-        return _cramer_rao(free_values.lidar_with(lidar, flat), traced, scene_noise, names, shapes, labels)
-
-    def cost_of_scene(flat: Array, traced: TracedScene, scene_noise: Any) -> Array:
-        return jnp.asarray(cost_of_bound(bound_of(flat, traced, scene_noise))).reshape(())
-
-    @eqx.filter_jit
-    def cost_and_slopes(fraction: Array, traced: TracedScene, scene_noise: Any) -> tuple[Array, Array]:
-        def of_fraction(fraction: Array) -> Array:
-            low, high = jnp.asarray(free_values.low), jnp.asarray(free_values.high)
-            return cost_of_scene(low + fraction * (high - low), traced, scene_noise)
-
-        return jax.value_and_grad(of_fraction)(fraction)
-
-    def mean_cost(flat: np.ndarray, traced_scenes: list[TracedScene]) -> float:
-        pairs = zip(traced_scenes, noises)
-        return float(np.mean([float(cost_of_scene(jnp.asarray(flat), *pair)) for pair in pairs]))
-
-    start = np.concatenate([np.ravel(np.asarray(value, float)) for value in free_values.of(lidar)])
-    initial_cost = mean_cost(start, traced_scenes)
-
-    def log_mean_cost(fraction: np.ndarray, traced_scenes: list[TracedScene]) -> tuple[float, np.ndarray]:
-        """Return the logarithm of the mean cost over scenes, and its gradient by fractions of the limits."""
-        terms = [cost_and_slopes(jnp.asarray(fraction), *pair) for pair in zip(traced_scenes, noises)]
-        mean = float(np.mean([float(value) for value, _ in terms]))
-        slopes = np.mean([np.asarray(slope, float) for _, slope in terms], axis=0)
-        # The bounds are infinite where an unknown leaves no trace in the record. The line search of the
-        # optimiser steps back from a large number, but not from infinity.
-        if not (np.isfinite(mean) and mean > 0 and np.all(np.isfinite(slopes))):
-            return _REJECTED_COST, np.zeros_like(fraction)
-        # Variances span orders of magnitude over the limits: their logarithm has even steps.
-        return float(np.log(mean)), slopes / mean
-
-    def minimise(
-        fraction: np.ndarray, traced_scenes: list[TracedScene], lower: np.ndarray, upper: np.ndarray
-    ) -> Any:
-        return optimize.minimize(
-            log_mean_cost,
-            fraction,
-            args=(traced_scenes,),
-            jac=True,
-            method="L-BFGS-B",
-            bounds=np.stack([lower, upper], axis=1),
-            options={"maxiter": max_steps},
-        )
-
-    def trace_divergences(
-        lower: np.ndarray, upper: np.ndarray, flat: np.ndarray, tolerance: float
-    ) -> list[TracedScene]:
-        """Trace divergences between fractions of the limits, until the cost is known between them.
-
-        `flat`: values of all free variables; that of the divergence is not used.
-        """
-        low, high = ((free_values.low + end * width)[is_divergence] for end in (lower, upper))
-
-        def cost_by_divergence(divergence: float, traced_scenes: list[TracedScene]) -> float:
-            return mean_cost(np.where(is_divergence, divergence, flat), traced_scenes)
-
-        nodes = DivergenceNodes(float(low[0]), float(high[0]), _FIRST_NODES)
-        return _refined(trace(lidar, nodes), cost_by_divergence, photon_key, tolerance)
-
-    width = free_values.high - free_values.low
-    first = (start - free_values.low) / width
-    is_divergence = free_values.is_value_of("divergence")
-    lower, upper = np.zeros_like(first), np.ones_like(first)
-    if np.any(is_divergence):
-        traced_scenes = trace_divergences(lower, upper, start, _COARSE_TOLERANCE)
-    drawn = np.asarray(jax.random.uniform(start_key, (starts - 1, first.size)), float)
+    lower, upper, varies_divergence = (
+        np.zeros_like(start),
+        np.ones_like(start),
+        "divergence" in free_values.paths,
+    )
+    if varies_divergence:
+        traced_scenes = problem.trace_divergences(tracer, lower, upper, start, _COARSE_TOLERANCE)
+    drawn = np.asarray(jax.random.uniform(start_key, (starts - 1, start.size)), float)
     # The cost has minima at each absorption band: one start would end in the next of them.
-    ends = [minimise(fraction, traced_scenes, lower, upper) for fraction in [first, *drawn]]
+    ends = [
+        problem.minimise(fraction, traced_scenes, lower, upper)
+        for fraction in [free_values.fraction_of(start), *drawn]
+    ]
     costs = np.exp([end.fun for end in ends])
     best: Any = min(ends, key=lambda end: end.fun)
     if best.fun >= _REJECTED_COST:
         raise ValueError("the cost is not a finite positive number at any start; see cost and unknowns")
-    if np.any(is_divergence):
+    if varies_divergence:
         # Once more from the best, between divergences near it: there the interpolation is accurate.
-        flat = free_values.low + best.x * width
-        near_low, near_high = (
-            np.clip((flat * factor - free_values.low) / width, 0.0, 1.0)
-            for factor in (1.0 / _NEAR_BEST, _NEAR_BEST)
-        )
-        lower, upper = np.where(is_divergence, near_low, lower), np.where(is_divergence, near_high, upper)
-        traced_scenes = trace_divergences(lower, upper, flat, _FINE_TOLERANCE)
-        best = minimise(best.x, traced_scenes, lower, upper)
-    flat = free_values.low + np.clip(best.x, 0.0, 1.0) * width
-    best_lidar = free_values.lidar_with(lidar, jnp.asarray(flat))
-    best_cost = float(np.exp(best.fun))
-    if np.any(is_divergence):
+        flat = free_values.at_fraction(best.x)
+        lower, upper = problem.limits_near(flat, lower, upper)
+        traced_scenes = problem.trace_divergences(tracer, lower, upper, flat, _FINE_TOLERANCE)
+        best = problem.minimise(best.x, traced_scenes, lower, upper)
+    flat = free_values.at_fraction(np.clip(best.x, 0.0, 1.0))
+    best_lidar, best_cost = free_values.lidar_with(lidar, jnp.asarray(flat)), float(np.exp(best.fun))
+    if varies_divergence:
         # Traced at the divergence that was found: without the error of the interpolation.
-        traced_scenes = trace(best_lidar, None)
-        best_cost = mean_cost(flat, traced_scenes)
+        traced_scenes = tracer.trace(best_lidar)
+        best_cost = problem.mean_cost(flat, traced_scenes)
+    best_values = [np.asarray(value, float) for value in free_values.of(best_lidar)]
     return Design(
         lidar=best_lidar,
-        values={
-            path: np.asarray(value, float)
-            for path, value in zip(free_values.paths, free_values.of(best_lidar))
-        },
+        values=dict(zip(free_values.paths, best_values)),
         cost=best_cost,
         initial_cost=initial_cost if np.isfinite(initial_cost) else float("inf"),
-        bounds=tuple(bound_of(jnp.asarray(flat), *pair) for pair in zip(traced_scenes, noises)),
+        bounds=problem.bounds(flat, traced_scenes),
         costs=costs,
         converged=bool(best.success),
     )
-
-
-def _refined(
-    traced_scenes: list[TracedScene],
-    cost_by_divergence: Callable[[float, list[TracedScene]], float],
-    key: PRNGKeyArray,
-    tolerance: float,
-) -> list[TracedScene]:
-    """Trace more divergences until the cost between them is interpolated to the tolerance.
-
-    The error is that at each new node, of the interpolation between those before. It counts where the cost is
-    not far above the lowest one: elsewhere, divergences that tell little have large relative errors.
-
-    `cost_by_divergence`: the mean cost over traced scenes, at a divergence.
-    """
-    while True:
-        refined = [refine_nodes(traced, key) for traced in traced_scenes]
-        nodes: Any = refined[0].nodes
-        interpolated, exact = (
-            np.array([cost_by_divergence(divergence, scenes) for divergence in nodes.divergences[1::2]])
-            for scenes in (traced_scenes, refined)
-        )
-        # Not finite where no record determines an unknown: no design has such a divergence.
-        lowest = np.fmin(interpolated, exact)
-        is_near = lowest < _NEAR_LOWEST * np.min(exact[np.isfinite(exact)], initial=np.inf)
-        errors = np.abs(interpolated[is_near] / exact[is_near] - 1.0)
-        errors = np.where(np.isfinite(errors), errors, np.inf)
-        error = float(np.max(errors, initial=0.0))
-        traced_scenes = refined
-        if error < tolerance:
-            return traced_scenes
-        if nodes.count >= _MAX_NODES:
-            warnings.warn(
-                f"the cost between the {nodes.count} divergences that were traced is known to {error:.1%} "
-                "only: the divergence found may not be the best; narrower limits, or more rays or photons, "
-                "help",
-                stacklevel=4,
-            )
-            return traced_scenes
-
-
-def _checked_scenes(scenes: Any) -> Sequence[Scene]:
-    check_kind("scenes", scenes, Sequence, "a Scene, or a sequence of Scene")
-    if len(scenes) == 0:
-        raise ValueError("scenes is empty; admissible is one scene or more")
-    for i, scene in enumerate(scenes):
-        check_kind(f"scenes[{i}]", scene, Scene, "a Scene")
-    return scenes
 
 
 def _free_values(lidar: Lidar, free: Any, limits: dict[str, Any]) -> FreeValues:

@@ -107,7 +107,10 @@ def plan_scenes(
     >>> print(wide)
     True
     """
-    examined = _extreme_scenes(scenes) if isinstance(scenes, Scene) else _checked_sequence(scenes)
+    if isinstance(scenes, Scene):
+        examined = _extreme_scenes(scenes)
+    else:
+        examined = check_scenes(scenes, "a Scene whose arrays are stacked, or a sequence of Scene")
     for scene in examined:
         check_kinds(lidar, scene)
     effects = {**effects_of_family(examined), **({} if effects is None else effects)}
@@ -174,8 +177,12 @@ def _plan_of(lidar: Lidar, scene: Scene, options: dict[str, Any]) -> Plan:
         raise ValueError(f"a scene at the extremes of the family is inadmissible: {error}") from error
 
 
-def _checked_sequence(scenes: Any) -> list[Scene]:
-    check_kind("scenes", scenes, Sequence, "a Scene whose arrays are stacked, or a sequence of Scene")
+def check_scenes(scenes: Any, expected: str) -> list[Scene]:
+    """Return a sequence of scenes as a list.
+
+    **Raises:** TypeError for another kind of argument, which names what is `expected`; ValueError for none.
+    """
+    check_kind("scenes", scenes, Sequence, expected)
     if len(scenes) == 0:
         raise ValueError("scenes is empty; admissible is one scene or more")
     for i, scene in enumerate(scenes):
