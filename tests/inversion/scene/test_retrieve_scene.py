@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.optimize import lsq_linear
 
 import inversion
 import jaxlidar as jl
@@ -369,24 +370,37 @@ def test_standard_errors_are_those_of_the_inverse_of_the_matrix():
 
 
 def test_averaging_kernels_hold_values_at_their_bounds():
+    """Kernels are finite differences of refits: least squares with bounds, to records of other truths."""
     random = np.random.default_rng(2)
     jacobian = random.normal(size=(30, 6)) + random.normal(size=(30, 1))
-    precision, width = np.diag(random.uniform(1.0, 20.0, 6)), np.full(6, 100.0)
+    precision = np.diag(random.uniform(1.0, 20.0, 6))
+    # The second and the fifth value are far beyond the bounds.
+    truth, low, high = np.array([0.1, 3.0, -0.2, 0.3, -2.0, 0.0]), np.full(6, -1.0), np.full(6, 1.0)
+
+    def refit(truth, bounds=(low, high)):
+        rows = np.concatenate([jacobian, np.sqrt(precision)])
+        return lsq_linear(rows, np.append(jacobian @ truth, np.zeros(6)), bounds, method="bvls", tol=1e-14).x
+
+    def differences(**changes):
+        steps = 0.01 * np.eye(6)
+        return np.stack([refit(truth + h, **changes) - refit(truth - h, **changes) for h in steps], 1) / 0.02
+
+    x, refits = refit(truth), differences()
+    at_bound = np.abs(x) == 1.0
+    np.testing.assert_array_equal(at_bound, [False, True, False, False, True, False])
+
     matrix = jacobian.T @ jacobian + precision
-    at_bound = np.array([False, True, False, False, True, False])
     problem = SimpleNamespace(product=lambda x, v: matrix @ v)
-    end = SimpleNamespace(x=np.zeros(6), scale=1.0 / np.sqrt(np.diag(matrix)))
-
-    def rows(is_free):
-        columns = [retrieval._Problem.solve(problem, end, unit, is_free) for unit in np.eye(6)]
-        return np.stack(columns) @ jacobian.T @ jacobian
-
+    end = SimpleNamespace(x=x, scale=1.0 / np.sqrt(np.diag(matrix)))
+    columns = [retrieval._Problem.solve(problem, end, unit, ~at_bound) for unit in np.eye(6)]
+    kernels = np.stack(columns) @ jacobian.T @ jacobian
+    np.testing.assert_allclose(kernels, refits, atol=0.02)
+    np.testing.assert_array_equal(kernels[at_bound], 0.0)
     # Those of fits of single records.
-    estimate = estimate_covariance(jacobian, precision, width, np.ones(30), None, at_bound=at_bound)
-    np.testing.assert_allclose(rows(~at_bound), estimate.averaging, atol=0.02)
-    np.testing.assert_array_equal(rows(~at_bound)[at_bound], 0.0)
-    # Negative control: with all values free, other rows change too.
-    assert np.abs(rows(None) - estimate.averaging)[~at_bound].max() > 0.1
+    estimate = estimate_covariance(jacobian, precision, high - low, np.ones(30), None, at_bound=at_bound)
+    np.testing.assert_allclose(estimate.averaging, refits, atol=1e-6)
+    # Negative control: without bounds, other rows change too.
+    assert np.abs(kernels - differences(bounds=(-np.inf, np.inf)))[~at_bound].max() > 0.1
 
 
 @pytest.mark.slow
