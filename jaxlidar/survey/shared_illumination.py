@@ -92,9 +92,12 @@ _MIN_RAYS = 64
 # The worst error of many shots, from few batches, is overestimated: steps are short, and the error
 # is predicted to fall by a factor of at most 1.4 in each.
 _STEPS = StepRule(safety=1.05, max_growth=1.05 * 1.4**2, min_step=2)
-# Groups aim a little below the tolerance: where some are brighter than others, squared errors add up to a
-# little more.
-_AIM = 0.97
+# Groups aim below the tolerance: their errors are relative to their own waveforms. Where these have another
+# shape than the sum of all groups, squared errors add up to more.
+_AIM = 0.94
+# Smallest fraction of the squared tolerance that is left to photons and rays where the error of the grid,
+# which no batch makes smaller, takes more.
+_LEAST_RANDOM_VARIANCE = 0.5
 # Fraction of the squared error that the first order may have where it is traced for each shot alone.
 _FIRST_ORDER_VARIANCE = 0.25
 
@@ -329,21 +332,40 @@ class ErrorTarget(NamedTuple):
     - `first_order_excess`: (s - 1) times the shot's order one in the group that traces it, s times in all
       others; 0 where all is traced by node. Added to the mean, it gives the fraction s of the complete
       waveform, to which errors are relative.
+    - `misplaced_energy`: by the grid, as in `NodeGroup`; None where all is traced by shot.
+    - `rtol`: tolerance of a shot, for the errors of all groups and of the grid.
     """
 
     coefficients: ShotCoefficients
     light_fraction: Float[np.ndarray, " shots"]
     variance_fraction: Float[np.ndarray, " shots"]
     first_order_excess: Float[np.ndarray, "shots wavelengths samples"] | float
+    misplaced_energy: Float[np.ndarray, "shots nodes"] | None
+    rtol: float
 
     def worst_error(self, moments: RunningMoments) -> float:
-        """Return the largest relative error of a shot, over the square root of its variance fraction."""
+        """Return the largest relative error of a shot, over the square root of its variance fraction.
+
+        It is the random error over the root of the fraction of the squared tolerance that the grid leaves.
+        """
         # The mean and the excess are estimated separately: where little returns, their sum may be negative.
         mean = np.maximum(_sum_over_traced(self.coefficients, moments.mean[0]) + self.first_order_excess, 0.0)
-        stderr = np.sqrt(_variance_of_sums(self.coefficients, moments.squares[0], moments.count))
-        # The error relative to the group's fraction is that times s relative to the complete waveform.
-        error = relative_error(mean, stderr) * self.light_fraction / np.sqrt(self.variance_fraction)
+        variance = _variance_of_sums(self.coefficients, moments.squares[0], moments.count)
+        error = self._relative_error(mean, variance)
+        if self.misplaced_energy is not None:
+            grid_error = self._relative_error(mean, _grid_variance(self.misplaced_energy, moments))
+            error = error / np.sqrt(np.maximum(1.0 - (grid_error / self.rtol) ** 2, _LEAST_RANDOM_VARIANCE))
         return float(np.max(error, initial=0.0))
+
+    def _relative_error(
+        self,
+        mean: Float[np.ndarray, "shots wavelengths samples"],
+        variance: Float[np.ndarray, "shots wavelengths samples"],
+    ) -> Float[np.ndarray, " shots"]:
+        """Return errors relative to complete waveforms, over the roots of the variance fractions."""
+        # The error relative to the group's fraction is that times s relative to the complete waveform.
+        error = relative_error(mean, np.sqrt(variance))
+        return np.asarray(error) * self.light_fraction / np.sqrt(self.variance_fraction)
 
 
 def _error_target(
@@ -351,6 +373,7 @@ def _error_target(
     group: NodeGroup,
     coefficients: ShotCoefficients,
     light: GroupLight,
+    rtol: float,
     key: PRNGKeyArray,
 ) -> ErrorTarget:
     """Return the shots that decide on the number of batches, and their errors."""
@@ -359,7 +382,8 @@ def _error_target(
     is_significant = fraction > _NEGLIGIBLE_FRACTION
     fraction, has_centre = fraction[is_significant], group.has_centre[is_significant]
     if light.shot_views is None:
-        return ErrorTarget(coefficients[is_significant], fraction, fraction, 0.0)
+        misplaced_energy = group.misplaced_energy[is_significant]
+        return ErrorTarget(coefficients[is_significant], fraction, fraction, 0.0, misplaced_energy, rtol)
     first = _compiled_first_order_samples(context.scene, context.model, light, key)
     # A shot's first order is traced, all of it, in the group that has its centre.
     first_of_shots = np.asarray(first)[: len(group.shots)][is_significant]
@@ -367,7 +391,7 @@ def _error_target(
     # Over all groups these fractions add up to 1: a shot has its centre in one of them, and its light in all.
     # The group with the centre has a larger one, as it alone traces the first order.
     variance = _FIRST_ORDER_VARIANCE * has_centre + (1.0 - _FIRST_ORDER_VARIANCE) * fraction
-    return ErrorTarget(coefficients[is_significant], fraction, variance, excess)
+    return ErrorTarget(coefficients[is_significant], fraction, variance, excess, None, rtol)
 
 
 class GroupEstimate(AbstractEstimate):
@@ -422,15 +446,14 @@ def trace_group(
         moments = jax.tree.map(np.asarray, moments)
         return moments._replace(count=int(moments.count))
 
-    estimate = GroupEstimate(trace, _error_target(context, group, coefficients, light, key))
+    estimate = GroupEstimate(trace, _error_target(context, group, coefficients, light, rtol, key))
     stop = StoppingRule(_AIM * rtol, min_size=MIN_BATCHES, max_size=MAX_BATCHES)
     sample_until(estimate, stop, _STEPS)
 
     moments: RunningMoments = estimate.moments
     variance, energy_variance = (_variance_of_sums(coefficients, a, moments.count) for a in moments.squares)
     if context.view_geometry is None:
-        # Light at the wrong place about a node is an error as large as what the node returns of it.
-        variance = variance + _sum_over_traced(group.misplaced_energy**2, moments.mean[0] ** 2)
+        variance = variance + _grid_variance(group.misplaced_energy, moments)
     # A shot counts the photons of all nodes that it uses, which other shots may count too.
     illuminated = np.abs(group.coefficients) > 0
     photons_per_node = np.bincount(group.photons.node, minlength=group.coefficients.shape[1])
@@ -545,6 +568,14 @@ def _sum_over_traced(coefficients: ShotCoefficients, values: Any) -> Any:
         return (coefficients @ a.reshape(len(a), -1)).reshape(coefficients.shape[0], *a.shape[1:])
 
     return jax.tree.map(sum_array, values)
+
+
+def _grid_variance(
+    misplaced_energy: Float[np.ndarray, "shots nodes"], moments: RunningMoments
+) -> Float[np.ndarray, "shots wavelengths samples"]:
+    """Return the squared error of the grid, sum_n (m_fn W_n)^2."""
+    # Light at the wrong place about a node is an error as large as what the node returns of it.
+    return _sum_over_traced(misplaced_energy**2, moments.mean[0] ** 2)
 
 
 def _variance_of_sums(coefficients: ShotCoefficients, squares: Any, count: int) -> Any:

@@ -145,17 +145,20 @@ def misplaced_light(transmittances, size):
     extent = 0.5 * size * len(transmittances)
     raster = np.arange(-extent + 0.5 * cell, extent, cell)
     column = np.minimum(((raster + extent) / size).astype(int), len(transmittances) - 1)
-    light = transmittances[np.ix_(column, column)]
     nodes = np.arange(splines.coefficients.shape[1])
     errors, estimates = [], []
     for (x, y), first, coefficients, misplaced in zip(
         survey.position, splines.first_node, splines.coefficients, splines.misplaced_energy
     ):
+        # No spline of the footprint, of 5 m, reaches beyond 9 m.
+        near_x, near_y = (np.flatnonzero(np.abs(raster - centre) < 9.0) for centre in (x, y))
+        light = transmittances[np.ix_(column[near_x], column[near_y])]
         along_x, along_y = (
-            cubic_bspline(raster[:, None] / splines.spacing - (first[k] + nodes)) / 12.0 for k in (0, 1)
+            cubic_bspline(raster[near, None] / splines.spacing - (first[k] + nodes)) / 12.0
+            for k, near in enumerate((near_x, near_y))
         )
         returned = along_x.T @ light @ along_y
-        distance = np.hypot(raster[:, None] - x, raster[None, :] - y)
+        distance = np.hypot(raster[near_x, None] - x, raster[None, near_y] - y)
         beam = np.clip(0.5 + (5.0 - distance) / cell, 0.0, 1.0)
         errors.append(np.sum(coefficients * returned) - np.sum(beam * light) / np.sum(beam))
         estimates.append(np.sqrt(np.sum((misplaced * returned) ** 2)))
@@ -171,7 +174,7 @@ def test_the_error_of_the_grid_is_estimated_from_above(size):
     """
     random, number = np.random.default_rng(4), int(44.0 / size)
     halves = random.permutation(np.arange(number**2) % 2).reshape(number, number)
-    few = random.uniform(size=(number, number)) < 0.05
+    sparse = random.uniform(size=(number, number)) < 0.05
 
     def ratio(transmittances):
         errors, estimates = misplaced_light(transmittances.astype(float), size)
@@ -179,7 +182,7 @@ def test_the_error_of_the_grid_is_estimated_from_above(size):
 
     assert 0.25 < ratio(halves) < 1.0
     assert ratio(0.8 + 0.2 * halves) < 0.15
-    assert size > 1.0 or ratio(few) > 1.0
+    assert size > 1.0 or ratio(sparse) > 1.0
 
 
 @pytest.mark.slow
