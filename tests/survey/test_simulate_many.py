@@ -184,9 +184,9 @@ def test_top_hats_agree_within_the_error_of_the_grid(shots, orders, monkeypatch)
     options = {"rtol": 0.03, "max_orders": orders, "shared": True}
     random_part = jl.simulate_many(survey, stand(), key=KEY, **options)
     assert np.mean(deviations(random_part, waves) ** 2) > 0.5
-    # Planted: random errors that are three times as large.
-    tripled = dataclasses.replace(random_part, stderr=3.0 * random_part.stderr)
-    assert np.mean(deviations(tripled, waves) ** 2) < 0.5
+    # Planted: random errors that are five times as large.
+    widened = dataclasses.replace(random_part, stderr=5.0 * random_part.stderr)
+    assert np.mean(deviations(widened, waves) ** 2) < 0.5
 
 
 @pytest.mark.slow
