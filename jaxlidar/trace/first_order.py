@@ -156,7 +156,9 @@ def move_rays(
     this takes the noise out of derivatives with respect to the beam's width.
     """
     across, ratio = rays_with_grids(scene, across)
-    mean_ratio = jnp.sum(energy * ratio) / jnp.sum(energy)
+    total = jnp.sum(energy)
+    # A mirror that is tilted away returns nothing of any ray.
+    mean_ratio = jnp.where(total > 0.0, jnp.sum(energy * ratio) / jnp.where(total > 0.0, total, 1.0), 1.0)
     return across, energy * (ratio / mean_ratio)
 
 

@@ -138,6 +138,12 @@ def test_grounds(name, law, ground_plans, precision):
     check(lidar, scene, ground_plans[law])
 
 
+def test_a_mirror_that_is_tilted_away_returns_nothing():
+    scene = jl.Scene(ground=jl.Ground(law=jl.Specular(), slope=10.0))
+    wave = jl.simulate(jl.Lidar(), scene, key=jax.random.key(0), rtol=0.1)
+    np.testing.assert_array_equal(wave.reflectance, 0.0)
+
+
 @pytest.fixture(scope="module")
 def ground_plans():
     """One plan for each law; grounds at grazing angles reach far beyond its window, which is admissible."""
