@@ -111,13 +111,14 @@ class Geolocation(NamedTuple):
     - `position`: (shots, 2) m, positions with the shift.
     - `scale`: (shots,) factor by which the simulated waveform is multiplied.
     - `fitted`: (shots, samples), or (shots, wavelengths, samples) as the records: simulated times `scale`.
-    - `chi_squared`: of the fit with the stated noise, over its degrees of freedom. One if there is only
-      noise.
+    - `chi_squared`: of a fit with the stated noise alone and the priors, with factors of its own, over its
+      degrees of freedom. One if there is only noise.
     - `status`: "converged", or the reason why the result is not to be used.
-    - `reflectance_ratio`: factor by which plants are brighter, relative to the ground, than in the scene; 1
-      where it was not fitted.
+    - `reflectance_ratio`: factor by which plants are brighter, relative to the ground, than in the scene, in
+      the first order and at all wavelengths; 1 where it was not fitted.
     - `misfit`: what the scene does not explain of a record, one standard deviation over the fitted waveform.
-    - `misfit_length`: m of height, over which the misfit is correlated.
+    - `misfit_length`: m of height, over which the misfit is correlated, from 0.5 to 8; without meaning where
+      `misfit` is 0.
 
     **Example:** 95 % limits of the shift.
 

@@ -13,8 +13,6 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-# Relative tolerance where none is asked for.
-DEFAULT_RTOL = 0.01
 # Fine bins over which a return at an instant is spread: the quadratic B-spline.
 KERNEL_BINS = 3
 # Second moment of that B-spline, in squared bins.

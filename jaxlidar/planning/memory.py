@@ -139,7 +139,7 @@ def jacobian_bytes(
 
 
 def transformed_bytes(config: TraceConfig, bins: TimeBins, *, degree: int, n_traces: int) -> float:
-    """Return the bytes of one simulation within a JAX transformation: a batch, and the sum of all."""
+    """Return the bytes of one simulation under `jax.vmap`: those of a batch, and of the sum of all."""
     response = response_bytes(config, bins, degree=degree, n_traces=n_traces)
     states = _STATE_NUMBERS * _photons_and_segments(config) * _number_bytes()
     return (1 + _RESPONSE_COPIES) * response + states

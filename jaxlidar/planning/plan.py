@@ -28,7 +28,7 @@ from jaxlidar.planning.channels import (
     reflection_probability,
     scene_optics,
 )
-from jaxlidar.planning.config import DEFAULT_RTOL, PathLimits, TimeBins, TraceConfig
+from jaxlidar.planning.config import PathLimits, TimeBins, TraceConfig
 from jaxlidar.planning.effect_table import effect_table, table_lines
 from jaxlidar.planning.effects import (
     Effect,
@@ -69,6 +69,7 @@ from jaxlidar.planning.size_buckets import size_bucket
 from jaxlidar.scenes.scene import Scene, check_kinds
 from jaxlidar.scenes.surfaces import AbstractSheet
 
+DEFAULT_RTOL = 0.01
 # Fewer batches give no trustworthy standard error.
 MIN_BATCHES = 8
 # Local estimates (next-event estimation) per free flight through a canopy: points from which light returns to
@@ -252,8 +253,8 @@ def plan(
     - `lidar`: a `Lidar`; or a `Survey`: the plan then serves all of its shots; its table is that of a shot
       in their middle with the largest zenith.
     - `scene`: a `Scene`.
-    - `rtol`: relative accuracy aimed at, in (0, 1); sets how many orders are worth following, and how wide
-      fine bins may be. Default None: 0.01.
+    - `rtol`: relative accuracy aimed at, in (0, 1); sets how many orders are worth following. Default None:
+      0.01.
     - `max_orders`: follow exactly this many scatterings, whatever `rtol` needs; at least 1. Default None:
       from `rtol` and the optics; with histories, as many as their table has room for (some 16 to 29).
     - `max_step`: longest segment, m, of a footprint ray that order one deposits at once; positive. The result
@@ -266,9 +267,8 @@ def plan(
       little of it is left, or 300 ns at most (3000 ns in dense canopies that absorb
       little).
     - `bin_width`: width of the fine bins, ns, positive; reduced to a whole fraction of the sampling interval.
-      Default None: a quarter of the pulse's finest feature with its jitter, times the fourth root of
-      `rtol` / 0.01, at most half of the feature, and between 0.05 and 1 sampling intervals; half an interval
-      for a pulse without duration.
+      Default None: a quarter of the pulse's finest feature with its jitter, between 0.05 and 1 sampling
+      intervals; half an interval for a pulse without duration.
     - `footprint`: "random" (each batch shifts the rays, so that the standard error covers them) or "fixed".
       Default "random".
     - `effects`: effects to switch off, by name, as in {"multiple scattering": False}; True asks for what is
@@ -365,7 +365,7 @@ def plan(
     first_return = path_lengths.first_path / SPEED_OF_LIGHT
     last_return = path_lengths.last_path / SPEED_OF_LIGHT
     tail = multiple_scattering_tail(scene, optics, first_return, last_return) if orders > 1 else 0.0
-    target_width = target_bin_width(interval, pulse_feature, pulse_std, bin_width, rtol)
+    target_width = target_bin_width(interval, pulse_feature, pulse_std, bin_width)
     bins, samples = bins_and_samples(lidar, scene, path_lengths, tail, window, target_width)
     bins_with_air = extend_to_air_return(bins, lidar, samples)
     bin_length = 0.5 * SPEED_OF_LIGHT * bins.width

@@ -7,12 +7,9 @@ from typing import NamedTuple
 from jaxlidar._checks import check_number, check_numbers, check_shape, concrete_number
 from jaxlidar._constants import SPEED_OF_LIGHT
 from jaxlidar.instrument.lidar import Lidar
-from jaxlidar.planning.config import DEFAULT_RTOL, KERNEL_BINS, TimeBins
+from jaxlidar.planning.config import KERNEL_BINS, TimeBins
 from jaxlidar.planning.path_lengths import PathLengths
 from jaxlidar.scenes.scene import Scene
-
-# Widest fine bins, over the finest feature of the pulse.
-_WIDEST_BINS = 0.5
 
 
 class SampleTimes(NamedTuple):
@@ -25,19 +22,13 @@ class SampleTimes(NamedTuple):
 
 
 def target_bin_width(
-    interval: float, pulse_feature: float, pulse_std: float, bin_width: float | None, rtol: float
+    interval: float, pulse_feature: float, pulse_std: float, bin_width: float | None
 ) -> float:
-    """Return the width of fine bins to aim at, ns: from the pulse's finest feature, or the user's.
-
-    The B-spline that spreads returns over bins widens the pulse. Its variance is taken out again, so that the
-    error of bins grows with the fourth power of their width. Bins of a quarter of the standard deviation of a
-    Gaussian pulse err by 0.1 %, a tenth of the default tolerance; the width goes with the fourth root of
-    another one.
-    """
+    """Return the width of fine bins to aim at, ns: from the pulse's finest feature, or the user's."""
     if bin_width is None:
-        fraction = min(0.25 * (rtol / DEFAULT_RTOL) ** 0.25, _WIDEST_BINS)
-        # A pulse without duration has no features.
-        feature_width = max(fraction * pulse_feature, 0.05 * interval)
+        # A quarter of the finest feature, as the B-spline that spreads returns over bins widens it. A pulse
+        # without duration has no features.
+        feature_width = max(0.25 * pulse_feature, 0.05 * interval)
         return min(interval, feature_width if pulse_std > 0 else 0.5 * interval)
     check_number("bin_width", bin_width, 0.0, low_open=True)
     return bin_width

@@ -18,7 +18,7 @@ from jaxlidar._checks import check_kind
 from jaxlidar.instrument.lidar import Lidar
 from jaxlidar.instrument.survey import Survey
 from jaxlidar.planning.effects import effects_of_family
-from jaxlidar.planning.memory import MAX_APPLIED_WAVELENGTHS
+from jaxlidar.planning.memory import MAX_APPLIED_WAVELENGTHS, transformed_bytes
 from jaxlidar.planning.path_lengths import PathLengths
 from jaxlidar.planning.plan import Plan, plan
 from jaxlidar.planning.size_buckets import size_bucket
@@ -90,8 +90,8 @@ def plan_scenes(
       combine the smallest and the largest values of heights, sizes, slopes and extinctions.
     - `window`: (first, last) sample time, ns. Default None: covers what `plan` chooses for each scene.
     - `max_orders`: orders of scattering. Default None: as many as any of the scenes calls for.
-    - `effects`, `options`: further arguments of `plan`. Its `histories` are False by default, for at most 8
-      wavelengths: a response by scattering history is large, and there is one for each scene.
+    - `effects`, `options`: further arguments of `plan`. Its `histories` are False by default where a scene
+      then takes less memory, as there is a response for each scene.
 
     **Returns:** a `Plan`.
 
@@ -114,11 +114,22 @@ def plan_scenes(
     for scene in examined:
         check_kinds(lidar, scene)
     effects = {**effects_of_family(examined), **({} if effects is None else effects)}
-    # Of many scenes, responses by history are many: applied optics take a tenth of the memory and less time.
-    if max_orders != 1 and lidar.wavelength.size <= MAX_APPLIED_WAVELENGTHS:
-        options.setdefault("histories", False)
-    cases = [(lidar, scene) for scene in examined]
-    return plan_cases(cases, window=window, max_orders=max_orders, effects=effects, **options)
+    cases, options = [(lidar, scene) for scene in examined], {"max_orders": max_orders, **options}
+    if options.get("histories") is None and _applied_optics_take_less(
+        *cases[0], window=window, effects=effects, **options
+    ):
+        options["histories"] = False
+    return plan_cases(cases, window=window, effects=effects, **options)
+
+
+def _applied_optics_take_less(lidar: Lidar, scene: Scene, **options: Any) -> bool:
+    """Return True if a scene takes less memory with optics that are applied while light is traced."""
+
+    def size(histories: bool | None) -> float:
+        p = plan(lidar, scene, **{**options, "histories": histories, "describe": False})
+        return transformed_bytes(p.config, p.bins, degree=p.degree, n_traces=p.n_traces)
+
+    return lidar.wavelength.size <= MAX_APPLIED_WAVELENGTHS and size(False) < size(None)
 
 
 def plan_cases(

@@ -10,10 +10,9 @@ from jaxlidar._summary import percent
 from jaxlidar.instrument.lidar import AIM_DISTANCE
 from jaxlidar.instrument.survey import Survey
 from jaxlidar.optics.laws import AbstractMirror
-from jaxlidar.planning.config import DEFAULT_RTOL
 from jaxlidar.planning.local_origin import move_aim_to_origin
 from jaxlidar.planning.parallel_light import beams_are_parallel, parallel_light_bound
-from jaxlidar.planning.plan import Plan
+from jaxlidar.planning.plan import DEFAULT_RTOL, Plan
 from jaxlidar.planning.plan import plan as make_plan
 from jaxlidar.planning.setup import Setup, make_setup
 from jaxlidar.scenes.scene import Scene
