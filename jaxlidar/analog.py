@@ -218,8 +218,8 @@ def _build_scene(lidar: Lidar, scene: Scene, plan: Plan) -> DeviceScene:
         )
     if not plan.config.keeps_histories:
         raise ValueError(
-            f"plan has {plan.orders} orders, too many to keep histories, or histories = False; admissible are "
-            "plans with histories = True, of fewer orders (max_orders=) where these are too many"
+            f"plan has {plan.orders} orders, too many to keep histories, or histories = False; admissible "
+            "are plans with histories = True, of fewer orders (max_orders=) where these are too many"
         )
     device_scene = build_device_scene(setup, derivatives="none")
     transmittance = device_scene.straight_transmittance
