@@ -470,11 +470,8 @@ def design(
     start = free_values.flat_of(lidar)
     initial_cost = problem.mean_cost(start, traced_scenes)
 
-    lower, upper, varies_divergence = (
-        np.zeros_like(start),
-        np.ones_like(start),
-        "divergence" in free_values.paths,
-    )
+    lower, upper = np.zeros_like(start), np.ones_like(start)
+    varies_divergence = "divergence" in free_values.paths
     if varies_divergence:
         traced_scenes = problem.trace_divergences(tracer, lower, upper, start, _COARSE_TOLERANCE)
     drawn = np.asarray(jax.random.uniform(start_key, (starts - 1, start.size)), float)

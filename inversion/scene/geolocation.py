@@ -10,11 +10,11 @@ stands for an integral; with the beams chosen here its error is 2e-4 of the wave
 Poisson's summation formula beyond the first). The nodes are simulated once, with all that the tracer knows.
 Derivatives with respect to the position p are those of g, exact for this sum.
 
-**Fit.** Record i is a_i (b P + R)(p_i + D_i theta), its misfit and noise. P is the light from plants and R
-all other, a_i a free factor of the record, b one of the survey (the reflectance of plants over that of the
-ground, relative to the scene's; its logarithm has a normal prior), theta the shift, and D_i = 1; with drift,
-the shift varies linearly along the survey. The factors a_i are eliminated (variable projection, Golub and
-Pereyra 1973).
+**Fit.** Record i is a_i (b P + R)(p_i + D_i theta), its misfit and noise. P is the first-order light from
+plants and R all other, a_i a free factor of the record, b one of the survey (the reflectance of plants over
+that of the ground, relative to the scene's; its logarithm has a normal prior), theta the shift, and D_i = 1;
+with drift, the shift varies linearly along the survey. The factors a_i are eliminated (variable projection,
+Golub and Pereyra 1973).
 
 **Misfit.** A scene does not explain records to their noise: columns of the canopy are brighter or darker than
 it says. This changes whole layers of a record at once. The misfit of record i is therefore a_i W_i(h) c
@@ -84,7 +84,7 @@ _REACH = 4.0
 # chi-squared is about as wide as the footprint.
 _COARSE_SPACING = 0.35
 # Minima from which Gauss-Newton steps start, and how many coarse steps lie between them.
-_STARTS, _APART = 3, 3.0
+_STARTS, _START_DISTANCE = 3, 3.0
 # Most trial steps from a start; the largest step, in standard errors and in m, that counts as converged.
 _MAX_STEPS, _SMALL_STEP, _SMALLEST_STEP = 40, 0.01, 1e-4
 # Fewest records for which the covariance is that of the jackknife over them.
@@ -93,8 +93,9 @@ _MIN_CLUSTERS = 6
 # first, a third, is less than 8 records tell; lengths a factor of 1.4 apart differ little, too.
 _MISFIT_SQUARES = np.concatenate([[0.0], np.logspace(-4.0, 0.5, 28)])
 _MISFIT_LENGTHS = 0.5 * 2.0 ** (0.5 * np.arange(9))
-# How often the misfit is found anew, and the signal over its maximum below which it is left out.
-_MISFIT_ROUNDS, _FAINT = 2, 1e-3
+# Number of estimates of the misfit, each followed by a fit; and the signal, over its maximum, below which
+# samples have no misfit.
+_MISFIT_ROUNDS, _LEAST_SIGNAL = 2, 1e-3
 # Least information, 1/m2, of which the covariance is the inverse.
 _LEAST_INFORMATION = 1e-12
 
@@ -475,19 +476,22 @@ class _ShotData(NamedTuple):
 class _Whitener(NamedTuple):
     """The inverse square root of I + V^T diag(variance) V, the covariance of a record over that of its noise.
 
-    - `vectors`: V, (rank, lit samples), orthonormal rows. - `variance`: (rank,).
-    - `lit`: (lit samples,) their places among the samples of all wavelengths; V is zero elsewhere.
+    - `vectors`: V, (rank, significant samples), orthonormal rows. - `variance`: (rank,).
+    - `significant`: (significant samples,) their numbers among the samples of all wavelengths; V is zero
+      elsewhere.
     """
 
     vectors: np.ndarray
     variance: np.ndarray
-    lit: np.ndarray
+    significant: np.ndarray
 
     def __call__(self, rows: np.ndarray) -> np.ndarray:
         """Whiten rows (..., wavelengths x samples)."""
         change = 1.0 / np.sqrt(1.0 + self.variance) - 1.0
         whitened = rows.copy()
-        whitened[..., self.lit] += ((rows[..., self.lit] @ self.vectors.T) * change) @ self.vectors
+        whitened[..., self.significant] += (
+            (rows[..., self.significant] @ self.vectors.T) * change
+        ) @ self.vectors
         return whitened
 
 
@@ -538,12 +542,12 @@ class _SurveyModel:
     ):
         self.nodes, self.drift, self.height_error = nodes, drift, height_error
         self.position = position
-        self.count = 2 + 2 * drift + (ratio_error > 0) + (height_error > 0)
+        self.n_parameters = 2 + 2 * drift + (ratio_error > 0) + (height_error > 0)
         # Place of the logarithm of the ratio among the parameters; the height offset is the last one.
-        self.ratio_place = 2 + 2 * drift if ratio_error > 0 else None
-        self.prior_precision = np.zeros(self.count)
-        if self.ratio_place is not None:
-            self.prior_precision[self.ratio_place] = ratio_error**-2
+        self.ratio_index = 2 + 2 * drift if ratio_error > 0 else None
+        self.prior_precision = np.zeros(self.n_parameters)
+        if self.ratio_index is not None:
+            self.prior_precision[self.ratio_index] = ratio_error**-2
         if height_error > 0:
             self.prior_precision[-1] = height_error**-2
         # All light of the nodes: that of the scene's own ratio.
@@ -578,7 +582,7 @@ class _SurveyModel:
 
     def ratio(self, parameters: np.ndarray) -> float:
         """Return the factor by which plants are brighter than in the scene."""
-        return 1.0 if self.ratio_place is None else float(np.exp(parameters[self.ratio_place]))
+        return 1.0 if self.ratio_index is None else float(np.exp(parameters[self.ratio_index]))
 
     def simulated(self, shot: _ShotData, parameters: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the waveform of a shot, (wavelengths, samples), and its derivatives, (parameters, ...)."""
@@ -588,7 +592,7 @@ class _SurveyModel:
         g = self._density(offset)
         # g and its derivatives east and north, of all nodes: one product with their waveforms.
         rows = np.stack([g, -slope[:, 0] * g, -slope[:, 1] * g])
-        if self.ratio_place is None:
+        if self.ratio_index is None:
             at_times, plants = np.tensordot(rows, self.total[shot.nodes], 1), None
         else:
             by_material = np.tensordot(rows, nodes.waveform[shot.nodes], 1)
@@ -614,7 +618,7 @@ class _SurveyModel:
 
     def fit(self, parameters: np.ndarray, misfit: _Misfit | None = None) -> _Fit:
         """Evaluate the fit, with the factors at their least-squares values; None: there is noise alone."""
-        n = self.count
+        n = self.n_parameters
         information, gradient = np.diag(self.prior_precision), -self.prior_precision * parameters
         objective = float(self.prior_precision @ parameters**2)
         determinant, scores, shot_information, scales = 0.0, [], [], []
@@ -663,31 +667,31 @@ class _SurveyModel:
             deviance = np.zeros(len(_MISFIT_SQUARES))
             for shot, model in zip(self.shots, models):
                 deviance += _misfit_deviance(shot, model, *self._misfit_rows(shot, model, length))
-            place = int(np.argmin(deviance))
-            if deviance[place] < lowest:
-                lowest, best = deviance[place], (float(np.sqrt(_MISFIT_SQUARES[place])), float(length))
+            index = int(np.argmin(deviance))
+            if deviance[index] < lowest:
+                lowest, best = deviance[index], (float(np.sqrt(_MISFIT_SQUARES[index])), float(length))
         relative, length = best
         whiteners = []
         for shot, model in zip(self.shots, models):
-            rows, lit = self._misfit_rows(shot, model, length)
+            rows, significant = self._misfit_rows(shot, model, length)
             vectors, variance = _principal_axes(rows)
-            whiteners.append(_Whitener(vectors, relative**2 * variance, lit))
+            whiteners.append(_Whitener(vectors, relative**2 * variance, significant))
         return _Misfit(relative, length, whiteners)
 
     def _misfit_rows(
         self, shot: _ShotData, model: np.ndarray, length: float
-    ) -> tuple[Float[np.ndarray, "rank lit"], Int[np.ndarray, " lit"]]:
-        """Return B, whose B^T B is the covariance of a misfit of unit size, and the samples that are lit.
+    ) -> tuple[Float[np.ndarray, "rank significant"], Int[np.ndarray, " significant"]]:
+        """Return B, whose B^T B is the covariance of a misfit of unit size, and the significant samples.
 
         It is over that of the noise. A Gaussian process with the correlation length l is a sum of
         independent Gaussians of the width l / sqrt(2). With the distance l their variance is even to 1.4 %.
         """
         total = model.sum(axis=0)
-        (samples,) = np.nonzero(total > _FAINT * max(float(total.max()), 1e-300))
+        (samples,) = np.nonzero(total > _LEAST_SIGNAL * max(float(total.max()), 1e-300))
         wavelengths = len(model)
-        lit = (np.arange(wavelengths)[:, None] * total.size + samples).ravel()
+        significant = (np.arange(wavelengths)[:, None] * total.size + samples).ravel()
         if not samples.size:
-            return np.zeros((0, 0)), lit
+            return np.zeros((0, 0)), significant
         step = (self.nodes.height[-1] - self.nodes.height[0]) / (self.nodes.height.size - 1)
         height = self.nodes.height[0] + step * shot.row[samples]
         knots = np.arange(height.min() - length, height.max() + 2.0 * length, length)
@@ -695,7 +699,7 @@ class _SurveyModel:
         # Wavelengths have a misfit each.
         weighted = (model * shot.inverse_noise)[:, samples]
         rows = np.einsum("ks,ws,wv->kwvs", shapes, weighted, np.eye(wavelengths))
-        return rows.reshape(-1, lit.size), lit
+        return rows.reshape(-1, significant.size), significant
 
     def chi_squared_of_shifts(self, shifts: Float[np.ndarray, "shifts 2"]) -> Float[np.ndarray, " shifts"]:
         """Return chi-squared for many shifts, without drift and height offset."""
@@ -720,8 +724,8 @@ def _principal_axes(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def _misfit_deviance(
     shot: _ShotData,
     model: np.ndarray,
-    rows: Float[np.ndarray, "rank lit"],
-    lit: Int[np.ndarray, " lit"],
+    rows: Float[np.ndarray, "rank significant"],
+    significant: Int[np.ndarray, " significant"],
 ) -> Float[np.ndarray, " sizes"]:
     """Return -2 ln of the restricted likelihood of a record, for all sizes of the misfit with rows B."""
     vectors, variance = _principal_axes(rows)
@@ -729,7 +733,7 @@ def _misfit_deviance(
     variances = _MISFIT_SQUARES[:, None] * variance
     # Products with the inverse of the covariance differ from plain ones by what lies along the eigenvectors.
     change = 1.0 / (1.0 + variances) - 1.0
-    along, power_along = vectors @ expected[lit], vectors @ power[lit]
+    along, power_along = vectors @ expected[significant], vectors @ power[significant]
     plain_square = max(float(expected @ expected), 1e-300)
     square = np.maximum(plain_square + change @ along**2, 1e-12 * plain_square)
     overlap = np.maximum(expected @ power + change @ (along * power_along), 0.0)
@@ -750,8 +754,8 @@ def _coarse_minima(model: _SurveyModel, search_radius: float, sigma: float) -> I
         if not remaining.any():
             return
         lowest = int(np.argmin(np.where(remaining, chi_squared, np.inf)))
-        remaining &= np.hypot(*(shifts - shifts[lowest]).T) > _APART * step
-        yield np.concatenate([shifts[lowest], np.zeros(model.count - 2)])
+        remaining &= np.hypot(*(shifts - shifts[lowest]).T) > _START_DISTANCE * step
+        yield np.concatenate([shifts[lowest], np.zeros(model.n_parameters - 2)])
 
 
 class _Descent(NamedTuple):
@@ -799,7 +803,7 @@ def _jackknife_covariance(fit: _Fit) -> np.ndarray:
     unit matrix, its eigenvalues would be one if noise and misfit were as modelled; smaller ones are raised.
     """
     shots, n = fit.scores.shape
-    # The floor keeps finite, and huge, what a single record tells.
+    # Without the only record that tells of a parameter nothing remains: the floor keeps the change finite.
     remaining = fit.information - fit.shot_information + _LEAST_INFORMATION * np.eye(n)
     changes = np.linalg.solve(remaining, fit.scores[:, :, None])[:, :, 0]
     jackknife = (shots - 1) / shots * changes.T @ changes

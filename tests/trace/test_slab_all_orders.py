@@ -77,7 +77,7 @@ def default_sum(leaf, tau, ground, **arguments):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("tau", SHARED_SLABS)
-def test_the_default_plan_follows_all_orders_that_matter(shared, tau):
+def test_automatic_orders_are_all_that_matter(shared, tau):
     with (shared / "reference" / "slabs_isotropic.csv").open() as file:
         (row,) = [r for r in csv.DictReader(file) if float(r["tau"]) == tau]
     leaf = jl.Isotropic(albedo=float(row["omega"]))

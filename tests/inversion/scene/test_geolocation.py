@@ -122,7 +122,7 @@ def test_drift_and_height_offset_are_found(case, nodes, monkeypatch):
 # -- misfit ------------------------------------------------------------------------------------------------
 
 
-def layered_nodes(search_radius):
+def layered_nodes():
     """Nodes of a rolling terrain under a canopy of varying height and cover, without a simulation."""
     spacing, sigma = 3.85, 5.5
     steps = spacing * np.arange(-30, 31)
@@ -166,7 +166,7 @@ def locate_layered(
 
 
 def test_misfit_and_ratio_of_reflectances_are_found(monkeypatch):
-    random, nodes = np.random.default_rng(0), layered_nodes(12.0)
+    random, nodes = np.random.default_rng(0), layered_nodes()
     place = locate_layered(random, monkeypatch, nodes, 24, misfit=0.15, ratio=1.4)
     assert place.status == "converged"
     assert place.misfit == pytest.approx(0.15, rel=0.3)
@@ -181,7 +181,7 @@ def test_misfit_and_ratio_of_reflectances_are_found(monkeypatch):
 
 
 def test_a_ratio_that_is_not_fitted_stays_as_in_the_scene(monkeypatch):
-    random, nodes = np.random.default_rng(1), layered_nodes(12.0)
+    random, nodes = np.random.default_rng(1), layered_nodes()
     place = locate_layered(random, monkeypatch, nodes, 8, misfit=0.1, ratio=1.4, ratio_error=0.0)
     assert place.reflectance_ratio == 1.0
     with pytest.raises(ValueError, match="ratio_error"):
@@ -190,7 +190,7 @@ def test_a_ratio_that_is_not_fitted_stays_as_in_the_scene(monkeypatch):
 
 def test_whitened_products_are_those_with_the_inverse_covariance(monkeypatch):
     """By the Gaussian correlation itself, of which the sum of Gaussians is within 1.4 %."""
-    random, nodes = np.random.default_rng(2), layered_nodes(12.0)
+    random, nodes = np.random.default_rng(2), layered_nodes()
     position = random.uniform(-60.0, 60.0, (2, 2))
     power, sigma, height = layered_records(random, nodes, position, 0.2, 2.0, 0.05)
     rows, noise = np.broadcast_to(height, power.shape), np.broadcast_to(sigma, power.shape)
@@ -243,7 +243,7 @@ def test_the_jackknife_is_that_of_fits_without_a_record():
 
 @pytest.mark.slow
 def test_standard_errors_hold_over_draws_of_misfit(monkeypatch):
-    random, nodes, z, z_of_noise = np.random.default_rng(4), layered_nodes(12.0), [], []
+    random, nodes, z, z_of_noise = np.random.default_rng(4), layered_nodes(), [], []
     for _ in range(40):
         state = random.bit_generator.state
         place = locate_layered(random, monkeypatch, nodes, 16, misfit=0.2)
