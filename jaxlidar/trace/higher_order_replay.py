@@ -1,4 +1,4 @@
-r"""Cotangents of extinction at orders two and above: photons are traced twice more.
+r"""Cotangents of extinction at orders two and above: flights are traced once more, and taken in reverse.
 
 Extinction does not move paths: points of collision are held at fractions of their chord through a voxel, and
 everything else is drawn from detached densities (`jaxlidar.trace.photons`). It acts on weights alone. With
@@ -9,15 +9,18 @@ respect to the extinction k_v of voxel v is (`jaxlidar.trace.score_functions`)
 
 Hence a flight and its collision count with the sum of all deposits from there on:
 
-1. The first walk sums the deposits D of every photon, S.
-2. In the second walk, from the same random numbers, S less what has been deposited so far is what lies
-   ahead. The depth of a flight is marched once more, and each voxel on the way gets minus the length in it
-   times that; the voxel of the collision gets it over its extinction, and voxels along return paths minus
-   their lengths times D.
+1. Photons are traced once more, from the same random numbers. Of every flight its ends are kept, with their
+   deposits D (`KeptFlights`).
+2. The flights are taken from the last to the first, and the deposits of each photon summed on the way. The
+   depth of a flight is marched again: each voxel gets minus the length in it times what comes from there on.
+   The voxel of the collision gets the same over its extinction, and voxels along return paths minus their
+   lengths times D.
 
-A flight has several ends. Each counts with its own deposit, and the selected one with what lies ahead, too.
-The state of a photon is all that is stored (path replay backpropagation; Vicini, Speierer and Jakob 2021, ACM
-Trans. Graph. 40, 108). Photons never collide where extinction is zero: such voxels get the lengths alone.
+A flight has several ends. Each counts with its own deposit, and the selected one with what comes after, too.
+A group of photons is traced at a time, the smaller the more orders there are, so that memory is bounded.
+Unlike in path replay backpropagation (Vicini, Speierer and Jakob 2021, ACM Trans. Graph. 40, 108), whose
+second walk finds what comes after as a difference, nothing is walked three times, and no rounding is left
+where a photon ends. Photons never collide where extinction is zero: such voxels get the lengths alone.
 """
 
 from typing import NamedTuple
@@ -27,11 +30,14 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int, UInt32
 
-from jaxlidar._one_function import once
+from jaxlidar._one_function import once, one_function
 from jaxlidar._vectors import Scalar, Vec
-from jaxlidar._vmapped_loops import any_problem
+from jaxlidar._vmapped_loops import any_problem, largest_count
+from jaxlidar.planning.config import Scatterer
 from jaxlidar.trace.device_scene import DeviceScene
 from jaxlidar.trace.higher_orders import (
+    CHUNKS_PER_GROUP,
+    PHOTONS_PER_CHUNK,
     FlightEnds,
     FlownPhotons,
     HigherOrderTally,
@@ -53,9 +59,61 @@ from jaxlidar.trace.voxel_traversal import (
     enter_grid,
     maximum,
     minimum,
+    select,
     step_voxel,
     voxel_above,
 )
+
+# Steps of a march between two subtractions from the voxels.
+STEPS_AT_A_TIME = 16
+
+
+# Flights of photons that are kept at a time, as long as a group has at least one chunk.
+MAX_KEPT_FLIGHTS = 1 << 16
+
+
+class KeptFlights(NamedTuple):
+    """Flights of chunks of photons, one chunk after another, as far as extinction acts on them.
+
+    - `number`: that of the photon in its group; one past the last for dead ones.
+    - `x`, `w`: start and direction. `targets`: optical depth of each end. `max_distance`: to where the photon
+      stops, whatever its depth, m. `selected`: the end from which it goes on.
+    - `cell`, `material`: voxel and material that each end collides with; the material is -1 if there is none,
+      or if it is that of a surface. `end_x`: position of each end.
+    - `deposits`: deposit of each end, times the cotangents of returns.
+    """
+
+    number: Int[Array, "*chunks photons"]
+    x: Vec
+    w: Vec
+    targets: Float[Array, "*chunks ends photons"]
+    max_distance: Float[Array, "*chunks photons"]
+    selected: Int[Array, "*chunks photons"]
+    cell: Int[Array, "*chunks ends_photons"]
+    material: Int[Array, "*chunks ends_photons"]
+    end_x: Vec
+    deposits: Float[Array, "*chunks ends photons"]
+
+    @staticmethod
+    def none(scene: DeviceScene, batch: PhotonBatch) -> "KeptFlights":
+        """Return room for a group of photons and all orders, with flights of dead photons in it."""
+        n_ends = scene.config.deposits_per_flight
+        chunks, size = batch.chunks_per_group * scene.config.order_steps, batch.chunk_size
+        number = jnp.full((chunks, size), batch.group_size)
+        one = jnp.zeros((chunks, size))
+        ends, flat = jnp.zeros((chunks, n_ends, size)), jnp.zeros((chunks, n_ends * size))
+        cell, vec, flat_vec = jnp.zeros(flat.shape, jnp.int32), (one, one, one), (flat, flat, flat)
+        return KeptFlights(
+            number, vec, vec, ends, one, jnp.zeros_like(number), cell, cell - 1, flat_vec, ends
+        )
+
+    def with_chunk(self, place: Int[Array, ""], chunk: "KeptFlights") -> "KeptFlights":
+        """Return these flights with those of a chunk at its place."""
+        return jax.tree.map(lambda kept, new: kept.at[place].set(new), self, chunk)
+
+    def chunk(self, place: Int[Array, ""]) -> "KeptFlights":
+        """Return the flights of the chunk at a place."""
+        return jax.tree.map(lambda kept: kept.at[place].get(mode="promise_in_bounds"), self)
 
 
 def pull_back_higher_orders(
@@ -66,12 +124,14 @@ def pull_back_higher_orders(
     Returns alone have derivatives; the energy budget has none (`jaxlidar.trace.tally_index`). For each group
     of photons:
 
-    1. Sum the deposits of every photon, times their cotangents.
-    2. Trace the same photons again, and add to the voxels.
+    1. Trace them again, and keep their flights with the deposits, times their cotangents.
+    2. From the last chunk of flights to the first, add to the voxels.
     """
     medium, bins = scene.medium, scene.bins
     assert medium is not None
-    batch, empty = PhotonBatch(scene, words), empty_tally(scene)
+    chunks = MAX_KEPT_FLIGHTS // (PHOTONS_PER_CHUNK * scene.config.order_steps)
+    chunks_per_group = max(1, min(chunks, CHUNKS_PER_GROUP))
+    batch, empty = PhotonBatch(scene, words, max_chunks_per_group=chunks_per_group), empty_tally(scene)
     padded = jax.ShapeDtypeStruct(empty.weights.shape, empty.weights.dtype)
     # Trimming is linear: its transpose is applied once, to the cotangents.
     (of_returns,) = jax.linear_transpose(bins.trim, padded)((cotangent.weights, cotangent.outside))
@@ -79,58 +139,52 @@ def pull_back_higher_orders(
     def trace_group(total: ExtinctionTables, group: UInt32[Array, ""]) -> tuple[ExtinctionTables, None]:
         first_lane = batch.first_lane(group)
 
-        def number_in_group(lanes: Lanes) -> Int[Array, "photons"]:
-            # Dead photons fill up chunks; the first of the group stands in for them (`compact`), whose sums
-            # they must not change.
-            number = (lanes.lane - first_lane).astype(jnp.int32)
-            return jnp.where(lanes.photons.alive, number, batch.group_size)
-
-        def trace_chunk(in_chunk: Lanes, state: _Walk, draws: PhotonDraws, order: Array):
-            flown, _ = fly(scene, in_chunk.photons, empty, draws, order)
-            ends, number = collide_at_ends(scene, flown), number_in_group(in_chunk)
-            deposits = _deposits(scene, flown, ends, of_returns, order)
+        def trace_chunk(in_chunk: Lanes, state: tuple[Array, KeptFlights], draws: PhotonDraws, order: Array):
+            n_chunks, kept = state
+            p = in_chunk.photons
+            flown, _ = fly(scene, p, empty, draws, order)
+            ends = collide_at_ends(scene, flown)
+            in_voxel = ends.flights.collided & (ends.collision.surface < 0)
+            flights = KeptFlights(
+                # Dead photons fill up chunks; the first of the group stands in for them (`compact`), whose
+                # sums they must not change.
+                number=jnp.where(p.alive, (in_chunk.lane - first_lane).astype(jnp.int32), batch.group_size),
+                x=p.x,
+                w=p.w,
+                targets=-jnp.log(flown.u),
+                max_distance=jnp.minimum(flown.encounters.nearest_stop, flown.max_length),
+                selected=flown.selected,
+                cell=ends.flights.cell,
+                material=jnp.where(in_voxel, ends.collision.material, -1),
+                end_x=ends.x,
+                deposits=_deposits(scene, flown, ends, of_returns, order),
+            )
             p, _ = scatter(scene, flown, empty)
-            in_order = jnp.sum(deposits, axis=0)
-            before = state.ahead.at[number].get(mode="fill", fill_value=0.0)
-            # Nothing lies ahead of a photon that has ended; rounding would leave a little.
-            after = jnp.where(p.alive, before - in_order, 0.0)
+            return Lanes(in_chunk.lane, p), (n_chunks + 1, kept.with_chunk(n_chunks, flights))
 
-            def add(tables: ExtinctionTables) -> ExtinctionTables:
-                numbers = jnp.arange(len(deposits))[:, None]
-                from_end_on = deposits + jnp.where(numbers == flown.selected[None], after[None], 0.0)
-                tables = _subtract_flights(scene, medium, tables, flown, from_end_on)
-                tables = _add_collisions(scene, medium, tables, ends, from_end_on.reshape(-1))
-                return _subtract_return_paths(scene, medium, tables, ends, deposits.reshape(-1))
+        nothing = (jnp.zeros((), jnp.int32), KeptFlights.none(scene, batch))
+        _, (n_chunks, kept) = batch.trace_orders(batch.send(group), nothing, trace_chunk)
+        n_chunks = largest_count(n_chunks)
 
-            # A loop of one step or none: its state is updated in place, where `cond` would copy the map.
-            n_steps = state.is_second.astype(jnp.int32)
-            tables = lax.fori_loop(0, n_steps, lambda _, tables: add(tables), state.tables)
-            ahead = jnp.where(state.is_second, after, before + in_order)
-            ahead = state.ahead.at[number].set(ahead, mode="drop")
-            return Lanes(in_chunk.lane, p), _Walk(state.is_second, tables, ahead)
+        def add_chunk(n: Array, state: tuple[ExtinctionTables, Array]) -> tuple[ExtinctionTables, Array]:
+            tables, later = state
+            flights = kept.chunk(n_chunks - 1 - n)
+            n_ends = jnp.arange(len(flights.deposits))[:, None]
+            comes_later = later.at[flights.number].get(mode="fill", fill_value=0.0)
+            from_end_on = flights.deposits + jnp.where(
+                n_ends == flights.selected[None], comes_later[None], 0.0
+            )
+            tables = _subtract_flights(scene, medium, tables, flights, from_end_on)
+            tables = _add_collisions(scene, medium, tables, flights, from_end_on.reshape(-1))
+            tables = _subtract_return_paths(scene, medium, tables, flights)
+            from_start_on = jnp.sum(from_end_on, axis=0)
+            return tables, later.at[flights.number].set(from_start_on, mode="drop")
 
-        def walk(state: tuple[ExtinctionTables, Array], is_second: Bool[Array, ""]):
-            _, end = batch.trace_orders(batch.send(group), _Walk(is_second, *state), trace_chunk)
-            return (end.tables, end.ahead), None
-
-        nothing = jnp.zeros((batch.group_size,), of_returns.dtype)
-        # One loop for both walks: what they share is compiled once.
-        return lax.scan(walk, (total, nothing), jnp.asarray([False, True]))[0][0], None
+        later = jnp.zeros((batch.group_size,), of_returns.dtype)
+        return lax.fori_loop(0, n_chunks, add_chunk, (total, later))[0], None
 
     zero = jax.tree.map(jnp.zeros_like, ExtinctionTables.of(scene))
     return lax.scan(trace_group, zero, jnp.arange(batch.n_groups, dtype=jnp.uint32))[0]
-
-
-class _Walk(NamedTuple):
-    """The state of a walk. `is_second`: True for the walk that adds to the tables.
-
-    `ahead`: for each photon of the group, the deposits of the first walk so far, and those that lie ahead in
-    the second.
-    """
-
-    is_second: Bool[Array, ""]
-    tables: ExtinctionTables
-    ahead: Float[Array, "photons"]
 
 
 def _deposits(
@@ -159,15 +213,13 @@ class _SubtractingMarch(NamedTuple):
     """State of the march of rays that subtract from voxels.
 
     - `distance`, `depth`: length, m, and optical depth up to here. `voxel`: the voxel ahead.
-    - `running`: False for rays that have stopped. `n_steps`: steps so far.
+    - `running`: False for rays that have stopped.
     """
 
     distance: Float[Array, "photons"]
     depth: Float[Array, "photons"]
     voxel: tuple[Int[Array, "photons"], ...]
     running: Bool[Array, "photons"]
-    n_steps: Int[Array, ""]
-    tables: ExtinctionTables
 
 
 def _subtract_lengths(
@@ -185,94 +237,102 @@ def _subtract_lengths(
 
     1. Find the nearest face, or the end of the ray, and look up the extinction of the voxel.
     2. For every end: the length in the voxel as far as the depth of its target.
-    3. Subtract the sum of these lengths times amounts, and go on to the next voxel.
+    3. The sum of these lengths times amounts is what the voxel loses. Go on to the next voxel.
+
+    Some steps are taken at a time, and then subtracted together: a loop without scatters is compiled as one
+    function.
 
     **Arguments:** `targets`: optical depths of the ends; infinite where all of a ray counts.
     """
     medium = scene.medium
     assert medium is not None
     end, largest = minimum(ray.leave, max_length), jnp.max(targets, axis=0)
+    ray, end, largest, targets, amounts = once((ray, end, largest, targets, amounts))
 
-    def step(state: _SubtractingMarch) -> _SubtractingMarch:
-        distance, depth, voxel, running, n_steps, tables = state
-        faces = ray.face_distances(voxel)
+    def step(state: _SubtractingMarch, _):
+        distance, depth, voxel, running = state
+        faces = once(ray.face_distances(voxel))
         to = maximum(distance, minimum(end, minimum(minimum(faces[0], faces[1]), faces[2])))
         cell = cell_index(medium, voxel)
         k = medium.extinction(cell, w)
         to, cell, k = once((to, cell, k))
-        length = jnp.where(running, to - distance, 0.0)
-        to_targets = (targets - depth[None]) / jnp.maximum(k, 1e-30)[None]
-        to_targets = jnp.clip(to_targets, 0.0, length[None])
-        tables = tables.add_total(medium, cell, w, -jnp.sum(amounts * to_targets, axis=0))
+        length = select(running, to - distance, jnp.zeros_like(to))
+        lost = jnp.zeros_like(to)
+        for target, amount in zip(targets, amounts):
+            to_target = (target - depth) / maximum(k, jnp.full_like(k, 1e-30))
+            lost = lost + amount * lax.clamp(jnp.zeros_like(length), to_target, length)
         next_depth = depth + k * length
         goes_on = running & (next_depth <= largest) & (to < end)
         next_voxel = step_voxel(ray, voxel, faces, to)
         # The voxel of a ray that has stopped does not matter.
-        distance = jnp.where(running, to, distance)
-        return _SubtractingMarch(distance, next_depth, next_voxel, goes_on, n_steps + 1, tables)
+        distance = select(running, to, distance)
+        return _SubtractingMarch(distance, next_depth, next_voxel, goes_on), (cell, lost)
 
-    def continue_(state: _SubtractingMarch) -> Bool[Array, ""]:
-        return any_problem(state.running) & (state.n_steps < scene.config.max_faces)
+    def take_steps(state: _SubtractingMarch):
+        return lax.scan(step, state, None, length=STEPS_AT_A_TIME)
+
+    def block(state: tuple[_SubtractingMarch, ExtinctionTables, Int[Array, ""]]):
+        march, tables, n_steps = state
+        march, (cell, lost) = one_function(take_steps)(march)
+        return march, tables.add_total(medium, cell, w, -lost), n_steps + STEPS_AT_A_TIME
+
+    def continue_(state) -> Bool[Array, ""]:
+        march, _, n_steps = state
+        return any_problem(march.running) & (n_steps < scene.config.max_faces)
 
     # Of rays whose amounts are all zero, nothing would be subtracted.
     running = jnp.any(amounts != 0.0, axis=0) & (ray.enter < end)
     start, zero = jnp.minimum(ray.enter, end), jnp.zeros_like(end)
-    state = _SubtractingMarch(start, zero, ray.voxel, running, jnp.zeros((), jnp.int32), tables)
-    return lax.while_loop(continue_, step, state).tables
+    march = _SubtractingMarch(start, zero, ray.voxel, running)
+    return lax.while_loop(continue_, block, (march, tables, jnp.zeros((), jnp.int32)))[1]
 
 
 def _subtract_flights(
     scene: DeviceScene,
     medium: Medium,
     tables: ExtinctionTables,
-    flown: FlownPhotons,
+    flights: KeptFlights,
     amounts: Float[Array, "ends photons"],
 ) -> ExtinctionTables:
     """Subtract the lengths of flights up to their ends, times the amounts of these."""
-    p = flown.p
-    max_distance = jnp.minimum(flown.encounters.nearest_stop, flown.max_length)
-    ray = once(enter_grid(medium, p.x, p.w, scene.occupied_box))
-    amounts = jnp.where(p.alive, amounts, 0.0)
-    return _subtract_lengths(scene, tables, ray, p.w, -jnp.log(flown.u), amounts, max_distance)
+    x, w = flights.x, flights.w
+    ray = enter_grid(medium, x, w, scene.occupied_box)
+    return _subtract_lengths(scene, tables, ray, w, flights.targets, amounts, flights.max_distance)
 
 
 def _add_collisions(
-    scene: DeviceScene, medium: Medium, tables: ExtinctionTables, ends: FlightEnds, amounts: Scalar
+    scene: DeviceScene, medium: Medium, tables: ExtinctionTables, flights: KeptFlights, amounts: Scalar
 ) -> ExtinctionTables:
     """Add amounts over the extinction of the material that was hit, in the voxels of collisions."""
-    cell, collision = ends.flights.cell, ends.collision
-    in_voxel = ends.flights.collided & (collision.surface < 0)
 
-    def over_extinction(table: Array | None, is_material: Bool[Array, "ends"]) -> Scalar | None:
-        if table is None:
+    def over_extinction(table: Array | None, scatterer: Scatterer | None) -> Scalar | None:
+        if table is None or scatterer is None:
             return None
-        k = table.at[cell].get(mode="promise_in_bounds")
-        counts = in_voxel & is_material & (k > 0.0)
+        k = table.at[flights.cell].get(mode="promise_in_bounds")
+        counts = (flights.material == scatterer.material) & (k > 0.0)
         return jnp.where(counts, amounts / jnp.where(counts, k, 1.0), 0.0)
 
-    config = scene.config
-    by_material = [
-        None if scatterer is None else over_extinction(table, collision.material == scatterer.material)
-        for table, scatterer in ((medium.leaf, config.leaf), (medium.bark, config.bark))
-    ]
+    of_leaf = over_extinction(medium.leaf, scene.config.leaf)
+    of_bark = over_extinction(medium.bark, scene.config.bark)
     # The tables themselves: a factor of direction cancels in dk / k.
-    return tables.add_tables(cell, by_material[0], by_material[1])
+    return tables.add_tables(flights.cell, of_leaf, of_bark)
 
 
 def _subtract_return_paths(
-    scene: DeviceScene, medium: Medium, tables: ExtinctionTables, ends: FlightEnds, deposits: Scalar
+    scene: DeviceScene, medium: Medium, tables: ExtinctionTables, flights: KeptFlights
 ) -> ExtinctionTables:
     """Subtract deposits times lengths in the voxels along their return paths.
 
     At nadir, they are subtracted from the table of depths straight up, whose own derivative goes on to
     voxels.
     """
+    x, deposits = flights.end_x, flights.deposits.reshape(-1)
     if scene.depth_above is not None:
-        cell, above, inside = voxel_above(medium, ends.x)
+        cell, above, inside = voxel_above(medium, x)
         amounts = jnp.where(inside, -deposits, 0.0)
         up = (jnp.zeros_like(above), jnp.zeros_like(above), jnp.ones_like(above))
         tables = tables.add_depth_above(cell, amounts)
         return tables.add_total(medium, cell, up, amounts * above * medium.size[2])
-    v = scene.beam.view(ends.x)
-    ray, infinite = once(enter_grid(medium, ends.x, v)), jnp.full_like(deposits, jnp.inf)
+    v = scene.beam.view(x)
+    ray, infinite = enter_grid(medium, x, v), jnp.full_like(deposits, jnp.inf)
     return _subtract_lengths(scene, tables, ray, v, infinite[None], deposits[None], infinite)

@@ -132,6 +132,7 @@ class PhotonBatch:
         words: UInt32[Array, "words"],
         nodes: EntryNodes | None = None,
         node_key: PRNGKeyArray | None = None,
+        max_chunks_per_group: int = CHUNKS_PER_GROUP,
     ):
         """`words`: the random words. `nodes`, `node_key`: about which light enters, and a key for that."""
         self.scene, self.nodes, self.node_key = scene, nodes, node_key
@@ -146,7 +147,7 @@ class PhotonBatch:
         self.chunk_size = min(PHOTONS_PER_CHUNK, n_photons)
         n_chunks = -(-n_photons // self.chunk_size)
         # Groups are made equally large, so that the last one is not mostly padding.
-        self.n_groups = -(-n_chunks * self.chunk_size // (CHUNKS_PER_GROUP * PHOTONS_PER_CHUNK))
+        self.n_groups = -(-n_chunks // max_chunks_per_group)
         self.chunks_per_group = -(-n_chunks // self.n_groups)
         self.group_size = self.chunks_per_group * self.chunk_size
 

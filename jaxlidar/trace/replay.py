@@ -3,9 +3,9 @@ r"""Reverse mode by replay: derivatives with respect to all voxels from one more
 A loss L of a response has cotangents y, its derivatives with respect to every value of the response. The
 gradient of L with respect to the extinction of every voxel is the product of y with the Jacobian. Reverse
 mode as JAX derives it keeps the state of every ray at every step, and for every step of a loop it adds a
-whole voxel map, almost all zeros. A replay keeps nothing: it walks the same paths again, from the same random
+whole voxel map, almost all zeros. A replay keeps no steps: it walks the same paths again, from the same random
 numbers, and adds what each step contributes to its voxel alone (path replay backpropagation; Vicini, Speierer
-and Jakob 2021, ACM Trans. Graph. 40, 108). Memory does not grow with rays or steps.
+and Jakob 2021, ACM Trans. Graph. 40, 108). Memory does not grow with rays, photons, steps or orders.
 
 `with_replay` gives a function that traces light this rule. Its derivatives are
 
@@ -53,7 +53,7 @@ class ExtinctionTables(NamedTuple):
         return ExtinctionTables(medium.leaf, medium.bark, medium.total, scene.depth_above)
 
     def add_tables(
-        self, cell: Int[Array, "rays"], of_leaf: Scalar | None, of_bark: Scalar | None
+        self, cell: Int[Array, "*rays"], of_leaf: Scalar | None, of_bark: Scalar | None
     ) -> "ExtinctionTables":
         """Add to the tables of leaf and of bark as they are, for G = 1/2."""
         leaf, bark = self.leaf, self.bark
@@ -71,19 +71,22 @@ class ExtinctionTables(NamedTuple):
     def add_materials(
         self,
         medium: Medium,
-        cell: Int[Array, "rays"],
+        cell: Int[Array, "*steps rays"],
         w: Vec,
         cotangents: tuple[Scalar | None, Scalar | None],
     ) -> "ExtinctionTables":
-        """Add cotangents of the extinction of leaf and of bark that `Medium` looked up at voxels."""
+        """Add cotangents of the extinction of leaf and of bark that `Medium` looked up at voxels.
+
+        `cell` may have several voxels of each ray, `w` is its direction.
+        """
         of_leaf, of_bark = cotangents
         factor = medium.projection_factor(w)
         if of_leaf is not None and factor is not None:
-            of_leaf = of_leaf * factor
+            of_leaf = of_leaf * jnp.broadcast_to(factor, of_leaf.shape)
         return self.add_tables(cell, of_leaf, of_bark)
 
     def add_total(
-        self, medium: Medium, cell: Int[Array, "rays"], w: Vec, cotangent: Scalar
+        self, medium: Medium, cell: Int[Array, "*steps rays"], w: Vec, cotangent: Scalar
     ) -> "ExtinctionTables":
         """Add cotangents of the extinction of both together that `Medium.extinction` looked up at voxels."""
         if self.total is not None:
@@ -91,7 +94,9 @@ class ExtinctionTables(NamedTuple):
         return self.add_materials(medium, cell, w, (cotangent, cotangent))
 
 
-def _scatter(table: Float[Array, "cells"], cell: Int[Array, "rays"], value: Scalar) -> Float[Array, "cells"]:
+def _scatter(
+    table: Float[Array, "cells"], cell: Int[Array, "*rays"], value: Float[Array, "*rays"]
+) -> Float[Array, "cells"]:
     return table.at[cell].add(value, mode="promise_in_bounds")
 
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import jaxlidar as jl
-from jaxlidar.trace import replay
+from jaxlidar.trace import higher_order_replay, replay
 from jaxlidar.trace.device_scene import build_device_scene
 from tests.helpers import agrees
 
@@ -113,7 +113,6 @@ CASES = [
 ]
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(("name", "build", "zenith", "orders", "names"), CASES)
 def test_forward_and_reverse_agree(name, build, zenith, orders, names):
     forward, reverse = forward_and_reverse(problem(build, zenith, orders), names)
@@ -193,6 +192,26 @@ def test_memory_does_not_grow_with_rays():
 def test_memory_does_not_grow_with_photons():
     small, large = (temporaries(6, n_photons=n) for n in (16_384, 131_072))
     assert large < 1.1 * small
+
+
+@pytest.mark.slow
+def test_memory_is_bounded_in_orders():
+    """Flights are kept of fewer photons at a time, the more orders there are."""
+    small, large = (temporaries(orders, n_photons=16_384) for orders in (8, 64))
+    assert small < 30e6
+    assert large < 1.1 * small
+
+
+@pytest.mark.slow
+def test_gradient_does_not_depend_on_the_photons_kept_at_a_time(monkeypatch):
+    loss, key = problem(everything, 12.0, 3, n_photons=2048), jax.random.key(1)
+
+    def gradient():
+        return jax.jit(jax.grad(lambda leaf: loss(START | {"leaf": leaf}, key)))(START["leaf"])
+
+    at_once = gradient()
+    monkeypatch.setattr(higher_order_replay, "MAX_KEPT_FLIGHTS", 1024)
+    np.testing.assert_allclose(gradient(), at_once, rtol=1e-4, atol=1e-6 * np.max(np.abs(at_once)))
 
 
 @pytest.mark.slow
