@@ -85,3 +85,13 @@ def add_rows(
         mode=lax.GatherScatterMode.PROMISE_IN_BOUNDS,
     )
     return flat.reshape(n_rows, padded)
+
+
+def take_rows(
+    tally: Float[Array, "rows padded"], row: Int[Array, "s"], first_bin: Int[Array, "s"], length: int
+) -> Float[Array, "s length"]:
+    """Return runs of contiguous bins of rows of a tally: the transpose of `add_rows`."""
+    index = (row * tally.shape[1] + first_bin)[:, None]
+    numbers = lax.GatherDimensionNumbers(offset_dims=(1,), collapsed_slice_dims=(), start_index_map=(0,))
+    mode = lax.GatherScatterMode.PROMISE_IN_BOUNDS
+    return lax.gather(tally.reshape(-1), index, numbers, (length,), mode=mode)

@@ -229,6 +229,34 @@ class ChunkTally(NamedTuple):
     slopes: Float[Array, "materials histories bins parameters"] | None
 
 
+class MaterialReturn(NamedTuple):
+    """What a material returns of segments: its extinction, 1/m, times a factor, times the pieces of these.
+
+    `row`: of the tally.
+    """
+
+    row: Int[Array, "..."] | int
+    extinction: Float[Array, "..."]
+    factor: Float[Array, "..."]
+    is_leaf: bool
+
+
+class SegmentReturns(NamedTuple):
+    """What segments return by bin and material, and what arrives there.
+
+    - `start_position`: of the start of each segment on the axis of bins.
+    - `first_bin`, `pieces`: as `integrate_over_bins` returns them.
+    - `returned`: factors of materials, and of plates in the path.
+    - `arrived`: pairs of the tally row and the energy that arrives.
+    """
+
+    start_position: Float[Array, "..."]
+    first_bin: Int[Array, "..."]
+    pieces: Float[Array, "pieces ..."]
+    returned: list[MaterialReturn]
+    arrived: list[tuple[Int[Array, "..."] | int, Scalar]]
+
+
 class FirstOrderTracer:
     """Deposits the returns of chunks of rays, and the energy that arrives, in parts that reverse mode shares.
 
@@ -348,65 +376,82 @@ class FirstOrderTracer:
         end = jnp.minimum(rays.end, self.scene.limits.start_distance)
         return rays.energy * self.scene.beam.in_view(rays.from_aim(along(rays.x, rays.w, end)))
 
-    # Materials are deposited one after the other, so that each has its own histories and intensity factor.
     def deposit_segments(
-        self,
-        tally: FirstOrderTally,
-        segments: RaySegments,
-        per_ray: tuple[FootprintRays, Scalar],
-        extinctions: tuple[Scalar | None, Scalar | None] | None = None,
+        self, tally: FirstOrderTally, segments: RaySegments, per_ray: tuple[FootprintRays, Scalar]
     ) -> FirstOrderTally:
-        """Add segments to a tally.
+        """Add segments to a tally; with score functions, their derivatives, too.
 
-        `per_ray`: the ray of each, and its seen energy. `extinctions`: those of leaf and of bark, 1/m; None
-        looks them up.
+        `per_ray`: the ray of each, and its seen energy.
+        """
+        scene, (rays, seen_energy) = self.scene, per_ray
+        light = self.returns_of_segments(segments, rays, seen_energy)
+        returned, arrived, return_slopes = tally.of_medium
+        for of_material in light.returned:
+            # Optimisation barriers: fused, the factor would be computed again for each piece, out of order.
+            row = once(light.pieces * once(of_material.extinction * of_material.factor)[None])
+            row = jnp.moveaxis(row, 0, -1)
+            tally_row = jnp.broadcast_to(of_material.row, light.first_bin.shape)
+            returned = add_rows(returned, tally_row, light.first_bin, row)
+            if scene.slopes is not None:
+                assert return_slopes is not None
+                rows = segment_derivatives(
+                    scene,
+                    of_material.is_leaf,
+                    rays.w,
+                    light.start_position,
+                    segments,
+                    self.kappa,
+                    of_material.extinction,
+                    of_material.factor,
+                )
+                return_slopes = add_parameter_rows(return_slopes, tally_row, light.first_bin, rows)
+        for tally_row, weight in light.arrived:
+            arrived = _add(arrived, tally_row, weight)
+        return tally._replace(returned=returned, arrived=arrived, slopes=return_slopes)
+
+    # Each material has its own histories and intensity factor.
+    def returns_of_segments(
+        self,
+        segments: RaySegments,
+        rays: FootprintRays,
+        seen_energy: Scalar,
+        extinctions: tuple[Scalar | None, Scalar | None] | None = None,
+    ) -> SegmentReturns:
+        """Compute what segments return, and what arrives there.
+
+        `extinctions`: those of leaf and of bark, 1/m; None looks them up.
 
         1. Integrate exp(-kappa tau) ds over each segment, bin by bin.
-        2. For each material, and each term of the plates in the path: add V_m k_m times these integrals.
-        3. With score functions, add their derivatives.
-        4. Add the energy that arrives, k_m times the integral of exp(-tau) ds.
+        2. For each material, and each term of the plates in the path: the factor V_m of these integrals,
+           beside k_m.
+        3. The energy that arrives, k_m times the integral of exp(-tau) ds.
         """
         scene, bins, config, kappa = self.scene, self.scene.bins, self.scene.config, self.kappa
-        histories = scene.first_histories
+        histories, w, distances = scene.first_histories, rays.w, rays.surface_distances
         leaf_material = -1 if config.leaf is None else config.leaf.material
         assert scene.medium is not None
-        (returned, arrived, return_slopes), (rays, seen_energy) = tally.of_medium, per_ray
-        k, w, distances = segments.extinction, rays.w, rays.surface_distances
         start_position = bins.position(2.0 * (rays.excess + segments.start) / SPEED_OF_LIGHT)
         first_bin, pieces = integrate_over_bins(bins, start_position, segments, kappa)
         # Integral of exp(-tau) ds over the segment: what arrives is attenuated once.
-        attenuated_length = jnp.exp(-segments.depth) * mean_decay(k * segments.length) * segments.length
+        decay = mean_decay(segments.extinction * segments.length)
+        attenuated_length = jnp.exp(-segments.depth) * decay * segments.length
         middle = segments.start + 0.5 * segments.length
         if extinctions is None:
             extinctions = material_extinctions(scene.medium, segments, w)
-        materials = _medium_materials(scene.medium, config, extinctions, w)
-        for m, material in materials if self.mirror is None else ():
-            value = material.extinction * (material.intensity_factor * seen_energy)
+        returned: list[MaterialReturn] = []
+        arrived: list[tuple[Int[Array, ...] | int, Scalar]] = []
+        # Rays that carry what a mirror returns deposit nothing else.
+        is_direct = self.mirror is None
+        materials = _medium_materials(scene.medium, config, extinctions, w) if is_direct else ()
+        for m, material in materials:
+            k, seen = material.extinction, material.intensity_factor * seen_energy
             scattered_history = int(histories.next_history[0, material.channel])
             for history, factor in self.two_passages.terms(histories, scattered_history, middle, distances):
-                tally_row = jnp.broadcast_to(self.row(m, history, rays), first_bin.shape)
-                # Optimisation barriers: fused, the factor would be computed again for each piece, out of
-                # order.
-                row = once(pieces * once(value * factor)[None])
-                row = jnp.moveaxis(row, 0, -1)
-                returned = add_rows(returned, tally_row, first_bin, row)
-                if scene.slopes is not None:
-                    assert return_slopes is not None
-                    rows = segment_derivatives(
-                        scene,
-                        m == leaf_material,
-                        w,
-                        start_position,
-                        segments,
-                        kappa,
-                        material.extinction,
-                        material.intensity_factor * seen_energy * factor,
-                    )
-                    return_slopes = add_parameter_rows(return_slopes, tally_row, first_bin, rows)
+                row = self.row(m, history, rays)
+                returned.append(MaterialReturn(row, k, seen * factor, m == leaf_material))
             for history, factor in self.one_passage.terms(histories, 0, middle, distances):
-                weight = material.extinction * attenuated_length * factor * rays.energy
-                arrived = _add(arrived, self.row(m, history, rays), weight)
-        return tally._replace(returned=returned, arrived=arrived, slopes=return_slopes)
+                arrived.append((self.row(m, history, rays), k * attenuated_length * factor * rays.energy))
+        return SegmentReturns(start_position, first_bin, pieces, returned, arrived)
 
     def deposit_surfaces(
         self,

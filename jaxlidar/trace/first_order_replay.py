@@ -25,10 +25,12 @@ from jaxtyping import Array, Float
 
 from jaxlidar._vectors import Scalar
 from jaxlidar._vmapped_loops import largest_count
+from jaxlidar.trace.deposit import take_rows
 from jaxlidar.trace.device_scene import DeviceScene
 from jaxlidar.trace.first_order import (
     FirstOrder,
     FirstOrderTracer,
+    SegmentReturns,
     march_rays,
     material_extinctions,
     move_rays,
@@ -68,6 +70,8 @@ def pull_back_first_order(
     (of_returned,) = jax.linear_transpose(trim, rows)((cotangent.weights, cotangent.outside))
     (of_unsmoothed,) = jax.linear_transpose(smooth_padded, rows)(of_returned)
     of_arrived, of_scattered = cotangent.arrived.reshape(-1), cotangent.scattered.reshape(-1)
+    # All energy that collides in the medium is scattered.
+    of_collided = of_arrived + of_scattered
 
     def add_chunk(tables: ExtinctionTables, chunk: list[Scalar]) -> tuple[ExtinctionTables, None]:
         # Step 1.
@@ -93,28 +97,54 @@ def pull_back_first_order(
             tables, of_depth_behind = state
             step = jax.tree.map(lambda a: a[n_steps - 1 - n], segments)
 
-            def deposited(k: Scalar, depth: Scalar, extinctions):
-                changed = dataclasses.replace(step, extinction=k, depth=depth)
-                tally = tracer.deposit_segments(empty, changed, per_ray, extinctions)
-                return tally.returned, tally.arrived
+            def contribution(
+                k: Scalar, extinctions: tuple[Scalar | None, Scalar | None] | None
+            ) -> tuple[Scalar, Scalar]:
+                """Return D of every segment: what of it returns, and what arrives, times cotangents."""
+                changed = dataclasses.replace(step, extinction=k)
+                light = tracer.returns_of_segments(changed, *per_ray, extinctions)
+                return _of_returns(light, of_unsmoothed), _of_arrivals(light, of_collided)
 
-            extinctions = material_extinctions(medium, step, rays.w)
-            _, pull = jax.vjp(deposited, step.extinction, step.depth, extinctions)
-            # All energy that collides in the medium is scattered.
-            of_k, of_depth, of_extinctions = pull((of_unsmoothed, of_arrived + of_scattered))
-            of_k = of_k + step.length * of_depth_behind
+            # Each segment has its own extinction: one derivative by forward mode has those of all. With one
+            # material alone, it is that of the segment.
+            extinctions, one = None, jnp.ones_like(step.extinction)
+            if medium.leaf is not None and medium.bark is not None:
+                extinctions = material_extinctions(medium, step, rays.w)
+                # Linear in the extinction of each material.
+                of_leaf = jnp.add(*contribution(step.extinction, (one, jnp.zeros_like(one))))
+                of_bark = jnp.add(*contribution(step.extinction, (jnp.zeros_like(one), one)))
+                tables = tables.add_materials(medium, step.cell, rays.w, (of_leaf, of_bark))
+            (returned, arrived), slopes = jax.jvp(
+                lambda k: contribution(k, extinctions), (step.extinction,), (one,)
+            )
+            of_k = jnp.add(*slopes) + step.length * of_depth_behind
             end = step.start + step.length
             for stop, of_stop in zip(rays.surface_distances, of_depths):
                 # What of the segment lies before the surface.
                 of_k = of_k + of_stop * (jnp.clip(stop, step.start, end) - step.start)
-            if medium.leaf is not None and medium.bark is not None:
-                tables = tables.add_materials(medium, step.cell, rays.w, of_extinctions)
-            else:
-                of_k = of_k + sum(c for c in of_extinctions if c is not None)
             tables = tables.add_total(medium, step.cell, rays.w, of_k)
-            return tables, of_depth_behind + of_depth
+            # All that returns has the factor exp(-kappa tau), and all that arrives exp(-tau).
+            return tables, of_depth_behind - tracer.kappa * returned - arrived
 
         return lax.fori_loop(0, n_steps, add_step, (tables, of_total_depth))[0], None
 
     zero = jax.tree.map(jnp.zeros_like, ExtinctionTables.of(scene))
     return lax.scan(add_chunk, zero, ray_chunks(*move_rays(scene, across, energy)))[0]
+
+
+def _of_returns(light: SegmentReturns, cotangent: Float[Array, "entries padded"]) -> Scalar:
+    """Return the sum over bins and materials of what segments return, times its cotangents."""
+    total = jnp.zeros_like(light.pieces[0])
+    for material in light.returned:
+        row = jnp.broadcast_to(material.row, light.first_bin.shape)
+        of_pieces = jnp.moveaxis(take_rows(cotangent, row, light.first_bin, light.pieces.shape[0]), -1, 0)
+        total = total + material.extinction * material.factor * jnp.sum(light.pieces * of_pieces, axis=0)
+    return total
+
+
+def _of_arrivals(light: SegmentReturns, cotangent: Float[Array, "entries"]) -> Scalar:
+    """Return the sum over materials of what arrives at segments, times its cotangents."""
+    total = jnp.zeros_like(light.pieces[0])
+    for row, energy in light.arrived:
+        total = total + energy * cotangent[row]
+    return total

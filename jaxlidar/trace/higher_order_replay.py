@@ -66,8 +66,6 @@ from jaxlidar.trace.voxel_traversal import (
 
 # Steps of a march between two subtractions from the voxels.
 STEPS_AT_A_TIME = 16
-
-
 # Flights of photons that are kept at a time, as long as a group has at least one chunk.
 MAX_KEPT_FLIGHTS = 1 << 16
 
@@ -99,21 +97,22 @@ class KeptFlights(NamedTuple):
         """Return room for a group of photons and all orders, with flights of dead photons in it."""
         n_ends = scene.config.deposits_per_flight
         chunks, size = batch.chunks_per_group * scene.config.order_steps, batch.chunk_size
+        of_photons, of_ends = jnp.zeros((chunks, size)), jnp.zeros((chunks, n_ends * size))
+        vector, end_x = (of_photons, of_photons, of_photons), (of_ends, of_ends, of_ends)
+        by_end, cell = of_ends.reshape(chunks, n_ends, size), of_ends.astype(jnp.int32)
         number = jnp.full((chunks, size), batch.group_size)
-        one = jnp.zeros((chunks, size))
-        ends, flat = jnp.zeros((chunks, n_ends, size)), jnp.zeros((chunks, n_ends * size))
-        cell, vec, flat_vec = jnp.zeros(flat.shape, jnp.int32), (one, one, one), (flat, flat, flat)
+        selected = jnp.zeros_like(number)
         return KeptFlights(
-            number, vec, vec, ends, one, jnp.zeros_like(number), cell, cell - 1, flat_vec, ends
+            number, vector, vector, by_end, of_photons, selected, cell, cell - 1, end_x, by_end
         )
 
     def with_chunk(self, place: Int[Array, ""], chunk: "KeptFlights") -> "KeptFlights":
         """Return these flights with those of a chunk at its place."""
-        return jax.tree.map(lambda kept, new: kept.at[place].set(new), self, chunk)
+        return jax.tree.map(lambda flights, new: flights.at[place].set(new), self, chunk)
 
     def chunk(self, place: Int[Array, ""]) -> "KeptFlights":
         """Return the flights of the chunk at a place."""
-        return jax.tree.map(lambda kept: kept.at[place].get(mode="promise_in_bounds"), self)
+        return jax.tree.map(lambda flights: flights.at[place].get(mode="promise_in_bounds"), self)
 
 
 def pull_back_higher_orders(
@@ -140,12 +139,12 @@ def pull_back_higher_orders(
         first_lane = batch.first_lane(group)
 
         def trace_chunk(in_chunk: Lanes, state: tuple[Array, KeptFlights], draws: PhotonDraws, order: Array):
-            n_chunks, kept = state
+            n_chunks, flights = state
             p = in_chunk.photons
             flown, _ = fly(scene, p, empty, draws, order)
             ends = collide_at_ends(scene, flown)
             in_voxel = ends.flights.collided & (ends.collision.surface < 0)
-            flights = KeptFlights(
+            in_order = KeptFlights(
                 # Dead photons fill up chunks; the first of the group stands in for them (`compact`), whose
                 # sums they must not change.
                 number=jnp.where(p.alive, (in_chunk.lane - first_lane).astype(jnp.int32), batch.group_size),
@@ -160,15 +159,15 @@ def pull_back_higher_orders(
                 deposits=_deposits(scene, flown, ends, of_returns, order),
             )
             p, _ = scatter(scene, flown, empty)
-            return Lanes(in_chunk.lane, p), (n_chunks + 1, kept.with_chunk(n_chunks, flights))
+            return Lanes(in_chunk.lane, p), (n_chunks + 1, flights.with_chunk(n_chunks, in_order))
 
         nothing = (jnp.zeros((), jnp.int32), KeptFlights.none(scene, batch))
-        _, (n_chunks, kept) = batch.trace_orders(batch.send(group), nothing, trace_chunk)
+        _, (n_chunks, group_flights) = batch.trace_orders(batch.send(group), nothing, trace_chunk)
         n_chunks = largest_count(n_chunks)
 
         def add_chunk(n: Array, state: tuple[ExtinctionTables, Array]) -> tuple[ExtinctionTables, Array]:
             tables, later = state
-            flights = kept.chunk(n_chunks - 1 - n)
+            flights = group_flights.chunk(n_chunks - 1 - n)
             n_ends = jnp.arange(len(flights.deposits))[:, None]
             comes_later = later.at[flights.number].get(mode="fill", fill_value=0.0)
             from_end_on = flights.deposits + jnp.where(

@@ -3,9 +3,9 @@ r"""Reverse mode by replay: derivatives with respect to all voxels from one more
 A loss L of a response has cotangents y, its derivatives with respect to every value of the response. The
 gradient of L with respect to the extinction of every voxel is the product of y with the Jacobian. Reverse
 mode as JAX derives it keeps the state of every ray at every step, and for every step of a loop it adds a
-whole voxel map, almost all zeros. A replay keeps no steps: it walks the same paths again, from the same random
-numbers, and adds what each step contributes to its voxel alone (path replay backpropagation; Vicini, Speierer
-and Jakob 2021, ACM Trans. Graph. 40, 108). Memory does not grow with rays, photons, steps or orders.
+whole voxel map, almost all zeros. A replay keeps no steps: it walks the same paths again, from the same
+random numbers, and adds what each step contributes to its voxel alone (path replay backpropagation; Vicini,
+Speierer and Jakob 2021, ACM Trans. Graph. 40, 108). Memory does not grow with rays, photons, steps or orders.
 
 `with_replay` gives a function that traces light this rule. Its derivatives are
 
