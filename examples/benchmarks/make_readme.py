@@ -694,6 +694,34 @@ def many_scenes(record: dict) -> str:
     )
 
 
+def posterior(record: dict) -> str:
+    spent = record["seconds"]
+    return page_of(
+        f"A target of the section above, with {record['photons']:,} photons in each of eight batches: leaf "
+        "chemistry, heights, leaf area and brightness of the ground, by `inversion.retrieve`, and by "
+        f"`inversion.log_density` and the no-U-turn sampler of blackjax, {record['draws']} draws of "
+        f"{record['gradients per draw']:.1f} gradients. The covariance of the fit is the sampler's metric, "
+        "and nothing is adapted.",
+        table(
+            ("unknown", "truth", "fit", "posterior", "effective draws"),
+            [
+                (
+                    r["name"],
+                    number(r["true"], 3),
+                    f"{number(r['fit'], 3)} ± {number(r['stderr'])}",
+                    f"{number(r['mean'], 3)} ± {number(r['standard deviation'])}",
+                    f"{r['effective draws']:.0f}",
+                )
+                for r in record["unknowns"]
+            ],
+        ),
+        f"The fit took {number(spent['fit'])} s with its compilation, the compilation of the sampler "
+        f"{number(spent['compilation'])} s, and the draws {number(spent['sampling'])} s: "
+        f"{number(1e3 * spent['gradient'])} ms a gradient. {100 * record['acceptance']:.0f} % of the steps "
+        "were accepted.",
+    )
+
+
 SECTIONS: dict[str, tuple[str, Callable[[dict], str]]] = {
     "accuracy_cost": ("Cost of accuracy", accuracy),
     "simulation_cost": ("Cost of `simulate`", simulation),
@@ -714,6 +742,7 @@ SECTIONS: dict[str, tuple[str, Callable[[dict], str]]] = {
     "gradient_cost": ("Gradients in every voxel", gradients),
     "fit_speed": ("Fits against scipy", fits),
     "retrieval_coverage": ("Accuracy and coverage of retrievals", coverage),
+    "posterior_sampling": ("Posterior of seven unknowns", posterior),
     "profiles": ("Vertical profiles against the closed form", profiles),
     "scene_retrieval": ("One scene from many records", scene_retrieval),
     "prospect_speed": ("PROSPECT against prosail", prospect),

@@ -240,6 +240,39 @@ class LogDensity(eqx.Module):
             column += size
         return jnp.asarray(np.concatenate(rows, axis=-1), self.initial.dtype)
 
+    def to_unconstrained_covariance(
+        self, covariance: Float[ArrayLike, "n n"], values: Mapping[str, ArrayLike]
+    ) -> Float[Array, "n n"]:
+        """Return the covariance of unconstrained coordinates from that of a fit, linearised at its values.
+
+        Samplers take it as their metric (blackjax: `inverse_mass_matrix`): steps are then long along
+        directions that the record leaves open, and no long adaptation has to find them.
+
+        **Arguments:**
+
+        - `covariance`: (n, n) of natural values, in the order of `names`, such as `Retrieval.covariance`.
+        - `values`: by name, as for `to_unconstrained`.
+
+        **Returns:** (n, n).
+
+        **Raises:** ValueError for a covariance of another shape, or with numbers that are not finite or
+        variances that are not positive, as of unknowns that nothing constrains; and as `to_unconstrained`.
+        """
+        x = self.to_unconstrained(values)
+        if x.ndim != 1:
+            raise ValueError(
+                f"values has leading axes {x.shape[:-1]}; admissible is one value of each unknown"
+            )
+        natural, n = as_numpy(covariance, "covariance"), len(self.names)
+        if natural.shape != (n, n):
+            raise ValueError(f"covariance has the shape {natural.shape}; admissible is ({n}, {n})")
+        check_range("covariance", natural)
+        check_range("the diagonal of covariance", np.diag(natural), 0.0, low_open=True)
+        x, width = np.asarray(x, float), np.asarray(self._width, float)
+        # Of dx / du; both factors keep their digits near the bounds.
+        slope = width / ((1.0 + np.exp(-x)) * (1.0 + np.exp(x)))
+        return jnp.asarray(natural / (slope[:, None] * slope[None]), self.initial.dtype)
+
     def _checked(self, x: Any) -> Array:
         x = jnp.asarray(x, self.initial.dtype)
         if x.ndim == 0 or x.shape[-1] != len(self.names):

@@ -68,7 +68,7 @@ class Medium(eqx.Module):
     programs.
 
     - `leaf`, `bark`, `total`: extinction coefficients, 1/m, by voxel; of leaf for G = 1/2. `total` is None
-      where the sum depends on direction.
+      where there is one of both, or their sum depends on direction.
     - `size`, `origin`: edges of a voxel, and lower corner of the map, m.
     - `angle_tables`, `leaf_angles`: of leaves that are not spherically oriented, else None.
     - `leaf_phase`, `bark_phase`: phase functions that take the place of facets, else None.
@@ -105,6 +105,8 @@ class Medium(eqx.Module):
             return _gather(self.total, cell)
         if self.bark is None:
             return self.leaf_extinction(cell, w)
+        if self.leaf is None:
+            return self.bark_extinction(cell)
         return self.leaf_extinction(cell, w) + self.bark_extinction(cell)
 
     def projection_factor(self, w: Vec) -> Scalar | None:
@@ -114,12 +116,8 @@ class Medium(eqx.Module):
     def with_leaf_scaled(self, factor: Float[Array, ""]) -> "Medium":
         """Return the medium with the extinction of leaf multiplied by `factor`."""
         leaf = None if self.leaf is None else self.leaf * factor
-        total = None if self.total is None else _sum_of(leaf, self.bark)
-        return dataclasses.replace(self, leaf=leaf, total=total)
-
-
-def _sum_of(leaf: Array | None, bark: Array | None) -> Array | None:
-    return leaf if bark is None else (bark if leaf is None else leaf + bark)
+        has_total = self.total is not None and leaf is not None and self.bark is not None
+        return dataclasses.replace(self, leaf=leaf, total=leaf + self.bark if has_total else None)
 
 
 def _gather(table: Float[Array, "cells"], cell: Int[Array, "*s"]) -> Scalar:
@@ -143,7 +141,7 @@ def make_medium(canopy: Canopy, aim: Float[Array, "3"]) -> Medium:
     return Medium(
         leaf=leaf,
         bark=bark,
-        total=_sum_of(leaf, bark) if angle_tables is None else None,
+        total=None if leaf is None or bark is None or angle_tables is not None else leaf + bark,
         size=voxels.voxel_size,
         origin=jnp.asarray(voxels.origin) - aim,
         angle_tables=angle_tables,

@@ -183,6 +183,42 @@ def test_a_smoothness_prior_without_strength_is_refused():
         )
 
 
+def test_covariances_are_those_of_draws():
+    """The covariance of coordinates, of draws in natural units that are close together, and near a bound."""
+    observed, time = noisy_record(ground(), 0.01)
+    unknowns = [Unknown("ground.height", bounds=(-1.0, 1.0), name="height"), REFLECTANCE]
+    options = {"noise": 0.01, "time": time, "key": jax.random.key(1)}
+    density = inversion.log_density(observed, LIDAR, ground(), unknowns, **options)
+    values = {"height": 0.99, "reflectance": 0.3}
+    covariance = np.array([[1e-8, 3e-7], [3e-7, 4e-5]])
+    with jax.enable_x64(True):
+        draws = np.random.default_rng(0).multivariate_normal(list(values.values()), covariance, 40_000)
+        low, width = (np.asarray(a, float) for a in (density._low, density._width))
+        fraction = (draws - low) / width
+        expected = np.cov(np.log(fraction / (1.0 - fraction)).T)
+    result = np.asarray(density.to_unconstrained_covariance(covariance, values))
+    np.testing.assert_allclose(result, expected, rtol=0.03)
+    with pytest.raises(AssertionError):
+        np.testing.assert_allclose(covariance / width[:, None] / width, expected, rtol=0.03)
+
+
+@pytest.mark.parametrize(
+    ("covariance", "message"),
+    [
+        (np.eye(3), r"covariance has the shape \(3, 3\); admissible is \(2, 2\)"),
+        (np.diag([1.0, np.inf]), "covariance = inf"),
+        (np.diag([1.0, 0.0]), "diagonal of covariance = 0"),
+    ],
+)
+def test_inadmissible_covariances_are_refused(covariance, message):
+    observed, time = noisy_record(ground(), 0.01)
+    unknowns = [Unknown("ground.height", bounds=(-1.0, 1.0), name="height"), REFLECTANCE]
+    options = {"noise": 0.01, "time": time, "key": jax.random.key(1)}
+    density = inversion.log_density(observed, LIDAR, ground(), unknowns, **options)
+    with pytest.raises(ValueError, match=message):
+        density.to_unconstrained_covariance(covariance, {"height": 0.0, "reflectance": 0.3})
+
+
 @pytest.mark.parametrize("package", ["blackjax", "numpyro"])
 def test_samplers_draw_from_the_posterior(package):
     sampler = pytest.importorskip(package)
