@@ -116,8 +116,8 @@ class Medium(eqx.Module):
     def with_leaf_scaled(self, factor: Float[Array, ""]) -> "Medium":
         """Return the medium with the extinction of leaf multiplied by `factor`."""
         leaf = None if self.leaf is None else self.leaf * factor
-        has_total = self.total is not None and leaf is not None and self.bark is not None
-        return dataclasses.replace(self, leaf=leaf, total=leaf + self.bark if has_total else None)
+        total = None if self.total is None or leaf is None or self.bark is None else leaf + self.bark
+        return dataclasses.replace(self, leaf=leaf, total=total)
 
 
 def _gather(table: Float[Array, "cells"], cell: Int[Array, "*s"]) -> Scalar:
