@@ -13,6 +13,8 @@ and its transmitted part f(pi - b). Straight back, at b = pi, f = 2/3: the mean 
 mean cosine 1/2.
 """
 
+import functools
+
 import jax.numpy as jnp
 import numpy as np
 
@@ -32,8 +34,7 @@ def facet_reflection(cos_angle: Scalar) -> Scalar:
     **Returns:** an array shaped as `cos_angle`.
     """
     c = jnp.clip(cos_angle, -1.0, 1.0)
-    b = _arccos(c)
-    return 2.0 / (3.0 * np.pi) * (jnp.sqrt(_one_minus_square(c)) - b * c)
+    return 2.0 / (3.0 * np.pi) * _forward_factor(jnp.abs(c)) + 2.0 / 3.0 * jnp.maximum(-c, 0.0)
 
 
 def facet_transmission(cos_angle: Scalar) -> Scalar:
@@ -45,17 +46,42 @@ def facet_transmission(cos_angle: Scalar) -> Scalar:
 
     **Returns:** an array shaped as `cos_angle`.
     """
-    return facet_reflection(-cos_angle)
+    c = jnp.clip(cos_angle, -1.0, 1.0)
+    return 2.0 / (3.0 * np.pi) * _forward_factor(jnp.abs(c)) + 2.0 / 3.0 * jnp.maximum(c, 0.0)
 
 
-def _one_minus_square(c: Scalar) -> Scalar:
-    """1 - c^2 without cancellation near c = 1 and -1; above zero, for the derivative of its root."""
-    return jnp.maximum((1.0 - c) * (1.0 + c), 1e-30)
+# As f(pi - b) = f(b) + 2/3 cos b, angles b up to pi/2 have all values, and reflection and transmission share
+# one evaluation. With x = 1 - cos b, sin b - b cos b is x^(3/2) times a function that is smooth from 0 to 1.
+# Its interpolation takes much less time than the inverse tangent, and has no cancellation at small angles.
+def _forward_factor(c: Scalar) -> Scalar:
+    """Return sin b - b cos b for b from 0 to pi/2, of c = cos b."""
+    x = 1.0 - c
+    smooth = jnp.zeros_like(x)
+    for coefficient in reversed(_smooth_coefficients(8 if jnp.finfo(x.dtype).bits == 32 else 17)):
+        smooth = smooth * (2.0 * x - 1.0) + float(coefficient)
+    # Above zero, for the derivative of the root.
+    return x * jnp.sqrt(jnp.maximum(x, 1e-30)) * smooth
 
 
-def _arccos(c: Scalar) -> Scalar:
-    # arctan2 keeps the derivative finite at the ends, where arccos has none.
-    return jnp.arctan2(jnp.sqrt(_one_minus_square(c)), c)
+@functools.cache
+def _smooth_coefficients(count: int) -> np.ndarray:
+    """Return coefficients of a polynomial in y = 1 - 2 cos b for (sin b - b cos b) / (1 - cos b)^(3/2).
+
+    Eight are exact to the last digit in single precision, seventeen in double.
+    """
+
+    def smooth(y: np.ndarray) -> np.ndarray:
+        x = 0.5 * (y + 1.0)
+        b = 2.0 * np.arcsin(np.sqrt(0.5 * x))
+        # The power series of sin b - b cos b, over b^3: all digits at small angles.
+        series, term = np.zeros_like(b), np.full_like(b, 1.0 / 3.0)
+        for n in range(1, 20):
+            series = series + term
+            term = -term * b * b * (n + 1) / (n * (2 * n + 2) * (2 * n + 3))
+        return series * (b / np.sqrt(x)) ** 3
+
+    # Truncated as Chebyshev's series, which is next to the best approximation.
+    return np.polynomial.chebyshev.cheb2poly(np.polynomial.chebyshev.chebinterpolate(smooth, 16)[:count])
 
 
 def facet_normal(incident: Vec, u: Scalar, v: Scalar) -> Vec:

@@ -25,6 +25,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int
 
+from jaxlidar._one_function import once
 from jaxlidar._vectors import Scalar, Vec, about, along, dot, polar, scale, vec
 from jaxlidar.optics.facets import facet_normal, facet_reflection, facet_transmission
 from jaxlidar.optics.phase import AbstractPhase
@@ -329,7 +330,7 @@ def intensity_factors(
         cos_scattering = dot(w, v)
         # The means over the normals of spherically oriented facets, so that the sampled normal does not
         # matter.
-        front, back = facet_reflection(cos_scattering), facet_transmission(cos_scattering)
+        front, back = once((facet_reflection(cos_scattering), facet_transmission(cos_scattering)))
         in_voxel = collision.surface < 0
         if config.leaf is not None:
             transmits.append(config.leaf.transmission >= 0)

@@ -6,6 +6,7 @@ transmitted one, and that of a phase function each integrate to pi, and straight
 
 import jax
 import jax.numpy as jnp
+import mpmath
 import numpy as np
 import pytest
 from scipy.integrate import quad
@@ -46,6 +47,26 @@ def test_every_lobe_integrates_to_its_energy(name):
     energy = 2.0 * np.sum(weight * factor)
     assert energy == pytest.approx(1.0, abs=TOLERANCE)
     assert 1.005 * energy != pytest.approx(1.0, abs=TOLERANCE)
+
+
+@pytest.mark.parametrize(("double", "rtol"), [(False, 5e-7), (True, 1e-13)])
+def test_facets_are_exact_to_the_last_digits(double, rtol):
+    """Against 40 digits, also where sin b and b cos b cancel, and with derivatives."""
+    near_ends = np.logspace(-15 if double else -6, -1, 30)
+    with jax.enable_x64(double), mpmath.workdps(40):
+        cosine = jnp.asarray(np.concatenate([np.linspace(-0.999, 0.999, 100), 1.0 - near_ends]), float)
+        reflection, slope = jax.vmap(jax.value_and_grad(facet_reflection))(cosine)
+        exact = [mpmath.mpf(float(c)) for c in cosine]
+        factor = 2 / (3 * mpmath.pi)
+        expected = [float(factor * (mpmath.sqrt(1 - c * c) - c * mpmath.acos(c))) for c in exact]
+        expected_slope = [float(-factor * mpmath.acos(c)) for c in exact]
+        mirrored = facet_transmission(-cosine)
+        np.testing.assert_allclose(reflection, expected, rtol=rtol)
+        np.testing.assert_allclose(mirrored, expected, rtol=rtol)
+        np.testing.assert_allclose(slope, expected_slope, rtol=10 * rtol, atol=10 * rtol)
+        # Planted: an error of a few last digits.
+        with pytest.raises(AssertionError):
+            np.testing.assert_allclose((1.0 + 4 * rtol) * reflection, expected, rtol=rtol)
 
 
 @pytest.mark.parametrize("angle", [10.0, 60.0, 90.0, 135.0, 180.0])
