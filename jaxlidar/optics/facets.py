@@ -69,19 +69,18 @@ def _smooth_coefficients(count: int) -> np.ndarray:
 
     Eight are exact to the last digit in single precision, seventeen in double.
     """
-
-    def smooth(y: np.ndarray) -> np.ndarray:
-        x = 0.5 * (y + 1.0)
-        b = 2.0 * np.arcsin(np.sqrt(0.5 * x))
-        # The power series of sin b - b cos b, over b^3: all digits at small angles.
-        series, term = np.zeros_like(b), np.full_like(b, 1.0 / 3.0)
-        for n in range(1, 20):
-            series = series + term
-            term = -term * b * b * (n + 1) / (n * (2 * n + 2) * (2 * n + 3))
-        return series * (b / np.sqrt(x)) ** 3
-
+    # Interpolation at the zeros of a Chebyshev polynomial, in x = 1 - cos b from 0 to 1.
+    y = np.cos(np.pi * (np.arange(17) + 0.5) / 17)
+    x = 0.5 * (y + 1.0)
+    b = 2.0 * np.arcsin(np.sqrt(0.5 * x))
+    # The power series of sin b - b cos b, over b^3: all digits at small angles.
+    series, term = np.zeros_like(b), np.full_like(b, 1.0 / 3.0)
+    for n in range(1, 20):
+        series = series + term
+        term = -term * b * b * (n + 1) / (n * (2 * n + 2) * (2 * n + 3))
+    interpolation = np.polynomial.chebyshev.chebfit(y, series * (b / np.sqrt(x)) ** 3, 16)
     # Truncated as Chebyshev's series, which is next to the best approximation.
-    return np.polynomial.chebyshev.cheb2poly(np.polynomial.chebyshev.chebinterpolate(smooth, 16)[:count])
+    return np.polynomial.chebyshev.cheb2poly(interpolation[:count])
 
 
 def facet_normal(incident: Vec, u: Scalar, v: Scalar) -> Vec:

@@ -329,7 +329,7 @@ def intensity_factors(
     if medium is not None:
         cos_scattering = dot(w, v)
         # The means over the normals of spherically oriented facets, so that the sampled normal does not
-        # matter.
+        # matter; behind an optimisation barrier, as they serve several results.
         front, back = once((facet_reflection(cos_scattering), facet_transmission(cos_scattering)))
         in_voxel = collision.surface < 0
         if config.leaf is not None:
