@@ -34,7 +34,8 @@ def with_derivative_of(value: Scalar, differentiated: Scalar) -> Scalar:
 
 @with_derivative_of.defjvp
 def _(primals, tangents):
-    return primals[0], tangents[1]
+    # Not the plain value: a second derivative holds products of first ones.
+    return with_derivative_of(*primals), tangents[1]
 
 
 def dot(a: Vec, b: Vec) -> Scalar:

@@ -122,7 +122,8 @@ def main() -> None:
     axes.barh(names, [c["ratio"] for c in cases][::-1])
     axes.axvline(3.0, color="black", linestyle="--", label="three simulations")
     axes.set(xlabel="times one simulation", title="Gradient in every voxel")
-    axes.legend()
+    axes.margins(x=0.4)
+    axes.legend(loc="center right")
     save_figure(figure, arguments.out / "gradient_cost.png")
     print_table(
         ("", "s", "times one", "times one, as called", "MB", "MB, 4 times as many", "compiled, s"),

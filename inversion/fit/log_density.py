@@ -250,13 +250,14 @@ class LogDensity(eqx.Module):
 
         **Arguments:**
 
-        - `covariance`: (n, n) of natural values, in the order of `names`, such as `Retrieval.covariance`.
+        - `covariance`: (n, n) of natural values, symmetric, in the order of `names`, such as
+          `Retrieval.covariance`. Unknowns of scale and recorder are among them.
         - `values`: by name, as for `to_unconstrained`.
 
         **Returns:** (n, n).
 
-        **Raises:** ValueError for a covariance of another shape, or with numbers that are not finite or
-        variances that are not positive, as of unknowns that nothing constrains; and as `to_unconstrained`.
+        **Raises:** ValueError for a covariance of another shape, or with numbers that are not finite, as of
+        unknowns that nothing constrains, or that is not positive definite; and as `to_unconstrained`.
         """
         x = self.to_unconstrained(values)
         if x.ndim != 1:
@@ -267,9 +268,17 @@ class LogDensity(eqx.Module):
         if natural.shape != (n, n):
             raise ValueError(f"covariance has the shape {natural.shape}; admissible is ({n}, {n})")
         check_range("covariance", natural)
-        check_range("the diagonal of covariance", np.diag(natural), 0.0, low_open=True)
+        variances = np.diag(natural)
+        check_range("the diagonal of covariance", variances, 0.0, low_open=True)
+        correlation = natural / np.sqrt(variances[:, None] * variances[None])
+        smallest = np.min(np.linalg.eigvalsh(0.5 * (correlation + correlation.T)))
+        if smallest <= 0.0 or not np.allclose(correlation, correlation.T, atol=1e-4):
+            raise ValueError(
+                "covariance is not that of any values (smallest eigenvalue of its correlations "
+                f"{smallest:.2g}); admissible is a symmetric, positive definite one"
+            )
         x, width = np.asarray(x, float), np.asarray(self._width, float)
-        # Of dx / du; both factors keep their digits near the bounds.
+        # dx / du of natural values x; both factors keep their digits near the bounds.
         slope = width / ((1.0 + np.exp(-x)) * (1.0 + np.exp(x)))
         return jnp.asarray(natural / (slope[:, None] * slope[None]), self.initial.dtype)
 

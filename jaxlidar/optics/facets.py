@@ -50,9 +50,9 @@ def facet_transmission(cos_angle: Scalar) -> Scalar:
     return 2.0 / (3.0 * np.pi) * _forward_factor(jnp.abs(c)) + 2.0 / 3.0 * jnp.maximum(c, 0.0)
 
 
-# As f(pi - b) = f(b) + 2/3 cos b, angles b up to pi/2 have all values, and reflection and transmission share
-# one evaluation. With x = 1 - cos b, sin b - b cos b is x^(3/2) times a function that is smooth from 0 to 1.
-# Its interpolation takes much less time than the inverse tangent, and has no cancellation at small angles.
+# As f(pi - b) = f(b) + 2/3 cos b, f is evaluated for b up to pi/2 alone, once for reflection and transmission.
+# With x = 1 - cos b, sin b - b cos b is x^(3/2) times a function that is smooth from 0 to 1. Its interpolation
+# takes much less time than the inverse tangent, and has no cancellation at small angles.
 def _forward_factor(c: Scalar) -> Scalar:
     """Return sin b - b cos b for b from 0 to pi/2, of c = cos b."""
     x = 1.0 - c
@@ -67,7 +67,7 @@ def _forward_factor(c: Scalar) -> Scalar:
 def _smooth_coefficients(count: int) -> np.ndarray:
     """Return coefficients of a polynomial in y = 1 - 2 cos b for (sin b - b cos b) / (1 - cos b)^(3/2).
 
-    Eight are exact to the last digit in single precision, seventeen in double.
+    Eight are exact to a few units in the last place in single precision, seventeen in double.
     """
     # Interpolation at the zeros of a Chebyshev polynomial, in x = 1 - cos b from 0 to 1.
     y = np.cos(np.pi * (np.arange(17) + 0.5) / 17)

@@ -246,7 +246,7 @@ class SegmentReturns(NamedTuple):
 
     - `start_position`: of the start of each segment on the axis of bins.
     - `first_bin`, `pieces`: as `integrate_over_bins` returns them.
-    - `returned`: factors of materials, and of plates in the path.
+    - `returned`: one for each material, and each term of the plates in the path.
     - `arrived`: pairs of the tally row and the energy that arrives.
     """
 

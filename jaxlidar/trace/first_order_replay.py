@@ -105,12 +105,12 @@ def pull_back_first_order(
                 light = tracer.returns_of_segments(changed, *per_ray, extinctions)
                 return _of_returns(light, of_unsmoothed), _of_arrivals(light, of_collided)
 
-            # Each segment has its own extinction: one derivative by forward mode has those of all. With one
-            # material alone, it is that of the segment.
+            # D of a segment depends on its own extinction alone, so that one forward derivative has those of
+            # all. With one material, its extinction is that of the segment.
             extinctions, one = None, jnp.ones_like(step.extinction)
             if medium.leaf is not None and medium.bark is not None:
                 extinctions = material_extinctions(medium, step, rays.w)
-                # Linear in the extinction of each material.
+                # D is linear in k_m at a fixed k: its derivative is D at k_m = 1.
                 of_leaf = jnp.add(*contribution(step.extinction, (one, jnp.zeros_like(one))))
                 of_bark = jnp.add(*contribution(step.extinction, (jnp.zeros_like(one), one)))
                 tables = tables.add_materials(medium, step.cell, rays.w, (of_leaf, of_bark))

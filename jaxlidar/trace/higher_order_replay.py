@@ -34,6 +34,7 @@ from jaxlidar._one_function import once, one_function
 from jaxlidar._vectors import Scalar, Vec
 from jaxlidar._vmapped_loops import any_problem, largest_count
 from jaxlidar.planning.config import Scatterer
+from jaxlidar.trace.deposit import take_rows
 from jaxlidar.trace.device_scene import DeviceScene
 from jaxlidar.trace.higher_orders import (
     CHUNKS_PER_GROUP,
@@ -197,12 +198,10 @@ def _deposits(
 
     def of_order_two_on() -> Float[Array, "ends photons"]:
         returns = returns_of_ends(scene, ends, flown.weight.reshape(-1), None, of_returns.shape[1])
-        bins = returns.first_bin[:, None] + jnp.arange(returns.row.shape[-1])[None]
-        deposits = jnp.zeros_like(returns.row)
+        deposits, table = jnp.zeros_like(returns.row), of_returns.reshape(-1, of_returns.shape[-1])
         for tally_row, values in returns.rows:
-            places = tally_row[:, None] * scene.bins.padded + bins
-            looked_up = of_returns.reshape(-1).at[places].get(mode="promise_in_bounds")
-            deposits = deposits + values * looked_up
+            of_values = take_rows(table, tally_row, returns.first_bin, values.shape[-1])
+            deposits = deposits + values * of_values
         return jnp.sum(deposits, axis=-1).reshape(flown.weight.shape)
 
     return lax.cond(is_deposited(scene, order), of_order_two_on, lambda: jnp.zeros_like(flown.weight))
@@ -259,7 +258,10 @@ def _subtract_lengths(
         lost = jnp.zeros_like(to)
         for target, amount in zip(targets, amounts):
             to_target = (target - depth) / maximum(k, jnp.full_like(k, 1e-30))
-            lost = lost + amount * lax.clamp(jnp.zeros_like(length), to_target, length)
+            to_target = lax.clamp(jnp.zeros_like(length), to_target, length)
+            # Collisions lie at fixed fractions of their chords, also for second derivatives.
+            fraction = lax.stop_gradient(to_target / maximum(length, jnp.full_like(length, 1e-30)))
+            lost = lost + amount * fraction * length
         next_depth = depth + k * length
         goes_on = running & (next_depth <= largest) & (to < end)
         next_voxel = step_voxel(ray, voxel, faces, to)
@@ -332,6 +334,8 @@ def _subtract_return_paths(
         up = (jnp.zeros_like(above), jnp.zeros_like(above), jnp.ones_like(above))
         tables = tables.add_depth_above(cell, amounts)
         return tables.add_total(medium, cell, up, amounts * above * medium.size[2])
-    v = scene.beam.view(x)
+    v, to_sensor = scene.beam.view(x), scene.beam.distance_to_sensor(x)
     ray, infinite = enter_grid(medium, x, v), jnp.full_like(deposits, jnp.inf)
-    return _subtract_lengths(scene, tables, ray, v, infinite[None], deposits[None], infinite)
+    # A sensor may be within the voxels.
+    to_end = infinite if to_sensor is None else to_sensor
+    return _subtract_lengths(scene, tables, ray, v, infinite[None], deposits[None], to_end)

@@ -24,7 +24,7 @@ materials, and the fraction of a chord at which a collision lies are held fixed;
 extinction move positions, path lengths and densities continuously, so that the expected value of the
 derivative is the derivative of the expected value. Photons that head for a surface are the exception: their
 directions move with voxel columns and terrain cells (`jaxlidar.trace.reparametrisation`). Photons never
-collide where the extinction coefficient is exactly zero, and the derivative with respect to it is zero here.
+collide where the extinction coefficient is exactly zero: its derivative lacks what would scatter from there.
 """
 
 import dataclasses

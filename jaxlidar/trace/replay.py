@@ -5,7 +5,8 @@ gradient of L with respect to the extinction of every voxel is the product of y 
 mode as JAX derives it keeps the state of every ray at every step, and for every step of a loop it adds a
 whole voxel map, almost all zeros. A replay keeps no steps: it walks the same paths again, from the same
 random numbers, and adds what each step contributes to its voxel alone (path replay backpropagation; Vicini,
-Speierer and Jakob 2021, ACM Trans. Graph. 40, 108). Memory does not grow with rays, photons, steps or orders.
+Speierer and Jakob 2021, ACM Trans. Graph. 40, 108). Memory does not grow with the number of rays or photons,
+nor with that of orders up to 256.
 
 `with_replay` gives a function that traces light this rule. Its derivatives are
 
@@ -88,7 +89,7 @@ class ExtinctionTables(NamedTuple):
     def add_total(
         self, medium: Medium, cell: Int[Array, "*steps rays"], w: Vec, cotangent: Scalar
     ) -> "ExtinctionTables":
-        """Add cotangents of the extinction of both together that `Medium.extinction` looked up at voxels."""
+        """Add cotangents of the whole extinction that `Medium.extinction` looked up at voxels."""
         if self.total is not None:
             return self._replace(total=_scatter(self.total, cell, cotangent))
         return self.add_materials(medium, cell, w, (cotangent, cotangent))

@@ -68,7 +68,7 @@ class Medium(eqx.Module):
     programs.
 
     - `leaf`, `bark`, `total`: extinction coefficients, 1/m, by voxel; of leaf for G = 1/2. `total` is None
-      where there is one of both, or their sum depends on direction.
+      where there is only one of them, or their sum depends on direction.
     - `size`, `origin`: edges of a voxel, and lower corner of the map, m.
     - `angle_tables`, `leaf_angles`: of leaves that are not spherically oriented, else None.
     - `leaf_phase`, `bark_phase`: phase functions that take the place of facets, else None.

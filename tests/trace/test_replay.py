@@ -65,16 +65,25 @@ def leaves_over_ground(p, leaf_angles=None):
     return jl.Scene(canopy=canopy, ground=jl.Ground(reflectance=0.5))
 
 
+def leaf_and_bark(p):
+    optics = jl.LeafOptics(reflectance=0.4, transmittance=0.3)
+    return jl.Scene(canopy=jl.Canopy(map_of(p), leaf=optics, bark=0.3), ground=jl.Ground(reflectance=0.5))
+
+
 def planophile(p):
     return leaves_over_ground(p, "planophile")
 
 
+# Within the voxels, looking down.
+INSIDE = {"sensor": (0.1, 0.0, 2.6), "divergence": 50.0, "zenith": 30.0}
+
+
 def problem(build, zenith, orders, n_rays=600, n_photons=300):
     """Return a loss of parameters and a key: it is not linear in the waveform."""
-    lidar = jl.Lidar(divergence=2.0, zenith=zenith, azimuth=0.0, wavelength=1064.0)
-    plan = jl.plan(
-        lidar, build(START), max_orders=orders, n_rays=n_rays, n_photons=n_photons, window=(-60.0, 40.0)
-    )
+    geometry = INSIDE if zenith == "inside" else {"divergence": 2.0, "zenith": zenith}
+    lidar = jl.Lidar(azimuth=0.0, wavelength=1064.0, **geometry)
+    window = (-5.0, 60.0) if zenith == "inside" else (-60.0, 40.0)
+    plan = jl.plan(lidar, build(START), max_orders=orders, n_rays=n_rays, n_photons=n_photons, window=window)
 
     def loss(p, key):
         setup = jl.make_setup(lidar, build(p), plan)
@@ -108,6 +117,9 @@ CASES = [
     pytest.param("everything", everything, 12.0, 2, tuple(START), marks=pytest.mark.slow),
     pytest.param("everything", everything, 12.0, 6, tuple(START), marks=pytest.mark.slow),
     pytest.param("voxels off nadir", everything, 12.0, 3, ("leaf", "bark"), marks=pytest.mark.slow),
+    pytest.param(
+        "sensor within the voxels", leaf_and_bark, "inside", 3, ("leaf", "bark"), marks=pytest.mark.slow
+    ),
     pytest.param("leaf angles", planophile, 8.0, 1, ("leaf",), marks=pytest.mark.slow),
     pytest.param("leaf angles", planophile, 0.0, 3, ("leaf", "voxel size"), marks=pytest.mark.slow),
 ]
@@ -119,9 +131,30 @@ def test_forward_and_reverse_agree(name, build, zenith, orders, names):
     scale = np.max(np.abs(forward))
     np.testing.assert_allclose(reverse, forward, rtol=2e-4, atol=2e-5 * scale)
     assert np.all(forward != 0.0)
-    # Planted: what lies behind a segment forgotten, or a derivative 1 % off.
+    # Planted: a derivative that is 1 % off.
     with pytest.raises(AssertionError):
         np.testing.assert_allclose(1.01 * reverse, forward, rtol=2e-4, atol=2e-5 * scale)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("zenith", "orders"), [(0.0, 2), (12.0, 3)])
+def test_second_derivatives_by_forward_over_reverse(zenith, orders):
+    """The Hessian is symmetric, and that of forward mode within forward mode."""
+    loss, key = problem(leaves_over_ground, zenith, orders, n_photons=256, n_rays=128), jax.random.key(1)
+    leaf = START["leaf"] + 0.05
+    v, w = jnp.asarray(np.random.default_rng(5).normal(size=(2, *leaf.shape)), leaf.dtype)
+
+    def of_leaf(leaf):
+        return loss(START | {"leaf": leaf}, key)
+
+    def slope(leaf):
+        return jax.jvp(of_leaf, (leaf,), (v,))[1]
+
+    product = jax.jit(lambda v: jax.jvp(jax.grad(of_leaf), (leaf,), (v,))[1])
+    forward = jax.jit(lambda w: jax.jvp(slope, (leaf,), (w,))[1])(w)
+    np.testing.assert_allclose(jnp.sum(w * product(v)), forward, rtol=1e-4)
+    np.testing.assert_allclose(jnp.sum(v * product(w)), forward, rtol=1e-4)
+    assert forward != 0.0
 
 
 @pytest.mark.slow
@@ -209,9 +242,18 @@ def test_gradient_does_not_depend_on_the_photons_kept_at_a_time(monkeypatch):
     def gradient():
         return jax.jit(jax.grad(lambda leaf: loss(START | {"leaf": leaf}, key)))(START["leaf"])
 
+    groups, original = [], higher_order_replay.PhotonBatch
+
+    def counted(*arguments, **options):
+        batch = original(*arguments, **options)
+        groups.append(batch.n_groups)
+        return batch
+
+    monkeypatch.setattr(higher_order_replay, "PhotonBatch", counted)
     at_once = gradient()
     monkeypatch.setattr(higher_order_replay, "MAX_KEPT_FLIGHTS", 1024)
     np.testing.assert_allclose(gradient(), at_once, rtol=1e-4, atol=1e-6 * np.max(np.abs(at_once)))
+    assert groups[-1] > groups[0]
 
 
 @pytest.mark.slow

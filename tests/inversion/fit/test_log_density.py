@@ -208,6 +208,8 @@ def test_covariances_are_those_of_draws():
         (np.eye(3), r"covariance has the shape \(3, 3\); admissible is \(2, 2\)"),
         (np.diag([1.0, np.inf]), "covariance = inf"),
         (np.diag([1.0, 0.0]), "diagonal of covariance = 0"),
+        (np.array([[1.0, 2.0], [2.0, 1.0]]), "not that of any values"),
+        (np.array([[1.0, 0.5], [0.0, 1.0]]), "not that of any values"),
     ],
 )
 def test_inadmissible_covariances_are_refused(covariance, message):
