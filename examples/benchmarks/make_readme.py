@@ -697,8 +697,8 @@ def many_scenes(record: dict) -> str:
 def posterior(record: dict) -> str:
     spent = record["seconds"]
     return page_of(
-        f"A target of the section above, with {record['photons']:,} photons in each of eight batches: leaf "
-        "chemistry, heights, leaf area and brightness of the ground, by `inversion.retrieve`, and by "
+        f"A target of `retrieval_coverage.py`, with {record['photons']:,} photons in each of eight batches: "
+        "leaf chemistry, heights, leaf area and brightness of the ground, by `inversion.retrieve`, and by "
         f"`inversion.log_density` and the no-U-turn sampler of blackjax, {record['draws']} draws of "
         f"{record['gradients per draw']:.1f} gradients. The covariance of the fit is the sampler's metric, "
         "and nothing is adapted.",

@@ -7,7 +7,7 @@ the peak of each wavelength. Leaf chemistry, two heights, leaf area and the grou
 `inversion.retrieve` and sampled by `inversion.log_density` and blackjax (`pip install '.[bayes]'`). The
 covariance of the fit is the metric of the sampler, whose step is fixed: nothing is adapted. Random numbers of
 the simulation are the same at each evaluation; photons change their paths with the unknowns, so that the
-density has small jumps, which lower the acceptance: more photons raise it.
+density has small jumps, which lower the acceptance.
 """
 
 import time

@@ -34,7 +34,7 @@ def facet_reflection(cos_angle: Scalar) -> Scalar:
     **Returns:** an array shaped as `cos_angle`.
     """
     c = jnp.clip(cos_angle, -1.0, 1.0)
-    return 2.0 / (3.0 * np.pi) * _forward_factor(jnp.abs(c)) + 2.0 / 3.0 * jnp.maximum(-c, 0.0)
+    return 2.0 / (3.0 * np.pi) * (_forward_factor(jnp.abs(c)) + np.pi * jnp.maximum(-c, 0.0))
 
 
 def facet_transmission(cos_angle: Scalar) -> Scalar:
@@ -46,13 +46,12 @@ def facet_transmission(cos_angle: Scalar) -> Scalar:
 
     **Returns:** an array shaped as `cos_angle`.
     """
-    c = jnp.clip(cos_angle, -1.0, 1.0)
-    return 2.0 / (3.0 * np.pi) * _forward_factor(jnp.abs(c)) + 2.0 / 3.0 * jnp.maximum(c, 0.0)
+    return facet_reflection(-cos_angle)
 
 
-# As f(pi - b) = f(b) + 2/3 cos b, f is evaluated for b up to pi/2 alone, once for both lobes.
-# With x = 1 - cos b, sin b - b cos b is x^(3/2) times a function that is smooth from 0 to 1. A polynomial for
-# it takes much less time than the inverse tangent, and has no cancellation at small angles.
+# As f(pi - b) = f(b) + 2/3 cos b, this is needed for b up to pi/2 alone. With x = 1 - cos b it is x^(3/2)
+# times a function that is smooth from 0 to 1. A polynomial for that takes much less time than the inverse
+# tangent, and has no cancellation at small angles.
 def _forward_factor(c: Scalar) -> Scalar:
     """Return sin b - b cos b for b from 0 to pi/2, of c = cos b."""
     x = 1.0 - c

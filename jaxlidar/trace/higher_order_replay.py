@@ -18,8 +18,8 @@ Hence a flight and its collision count with the sum of all deposits from there o
 
 A flight has several ends. Each counts with its own deposit, and the selected one with what comes after, too.
 A group of photons is traced at a time, the smaller the more orders there are, so that memory is bounded.
-Unlike in path replay backpropagation (Vicini, Speierer and Jakob 2021, ACM Trans. Graph. 40, 108), whose
-second walk finds what comes after as a difference, nothing is walked three times, and no rounding is left
+Path replay backpropagation (Vicini, Speierer and Jakob 2021, ACM Trans. Graph. 40, 108) keeps no flights. It
+traces photons twice more, and finds what comes after a flight as a difference, whose rounding would remain
 where a photon ends. Photons never collide where extinction is zero: such voxels get the lengths alone.
 """
 
@@ -94,7 +94,7 @@ class KeptFlights(NamedTuple):
     deposits: Float[Array, "*chunks ends photons"]
 
     @staticmethod
-    def none(scene: DeviceScene, batch: PhotonBatch) -> "KeptFlights":
+    def empty(scene: DeviceScene, batch: PhotonBatch) -> "KeptFlights":
         """Return room for a group of photons and all orders, with flights of dead photons in it."""
         n_ends = scene.config.deposits_per_flight
         chunks, size = batch.chunks_per_group * scene.config.order_steps, batch.chunk_size
@@ -145,7 +145,7 @@ def pull_back_higher_orders(
             flown, _ = fly(scene, p, empty, draws, order)
             ends = collide_at_ends(scene, flown)
             in_voxel = ends.flights.collided & (ends.collision.surface < 0)
-            in_order = KeptFlights(
+            chunk_flights = KeptFlights(
                 # Dead photons fill up chunks; the first of the group stands in for them (`compact`), whose
                 # sums they must not change.
                 number=jnp.where(p.alive, (in_chunk.lane - first_lane).astype(jnp.int32), batch.group_size),
@@ -160,19 +160,19 @@ def pull_back_higher_orders(
                 deposits=_deposits(scene, flown, ends, of_returns, order),
             )
             p, _ = scatter(scene, flown, empty)
-            return Lanes(in_chunk.lane, p), (n_chunks + 1, flights.with_chunk(n_chunks, in_order))
+            return Lanes(in_chunk.lane, p), (n_chunks + 1, flights.with_chunk(n_chunks, chunk_flights))
 
-        nothing = (jnp.zeros((), jnp.int32), KeptFlights.none(scene, batch))
+        nothing = (jnp.zeros((), jnp.int32), KeptFlights.empty(scene, batch))
         _, (n_chunks, group_flights) = batch.trace_orders(batch.send(group), nothing, trace_chunk)
         n_chunks = largest_count(n_chunks)
 
         def add_chunk(n: Array, state: tuple[ExtinctionTables, Array]) -> tuple[ExtinctionTables, Array]:
             tables, later = state
             flights = group_flights.chunk(n_chunks - 1 - n)
-            n_ends = jnp.arange(len(flights.deposits))[:, None]
+            end_number = jnp.arange(len(flights.deposits))[:, None]
             comes_later = later.at[flights.number].get(mode="fill", fill_value=0.0)
             from_end_on = flights.deposits + jnp.where(
-                n_ends == flights.selected[None], comes_later[None], 0.0
+                end_number == flights.selected[None], comes_later[None], 0.0
             )
             tables = _subtract_flights(scene, medium, tables, flights, from_end_on)
             tables = _add_collisions(scene, medium, tables, flights, from_end_on.reshape(-1))
@@ -296,9 +296,8 @@ def _subtract_flights(
     amounts: Float[Array, "ends photons"],
 ) -> ExtinctionTables:
     """Subtract the lengths of flights up to their ends, times the amounts of these."""
-    x, w = flights.x, flights.w
-    ray = enter_grid(medium, x, w, scene.occupied_box)
-    return _subtract_lengths(scene, tables, ray, w, flights.targets, amounts, flights.max_distance)
+    ray = enter_grid(medium, flights.x, flights.w, scene.occupied_box)
+    return _subtract_lengths(scene, tables, ray, flights.w, flights.targets, amounts, flights.max_distance)
 
 
 def _add_collisions(
