@@ -218,6 +218,7 @@ def gradients(record: dict) -> str:
             str(c["orders"]),
             number(c["seconds"]["gradient"]),
             number(c["ratio"]),
+            number(c["ratio_half_empty"]),
             number(c["ratio_as_called"]),
             number(c["MB"]),
             number(c["MB_four_times_the_photons"]),
@@ -231,6 +232,7 @@ def gradients(record: dict) -> str:
         "orders",
         "CPU s",
         "simulations",
+        "half the voxels empty",
         "calls of `simulate`",
         "MB",
         "MB, four times the photons",
@@ -241,7 +243,8 @@ def gradients(record: dict) -> str:
         "The gradient of a function of the waveform with respect to the leaf area density of every voxel, "
         f"with its value, by `jax.grad` of `simulate(..., plan=)`: {record['photons']:,} photons, "
         f"{record['rays']:,} rays. Times are compared with a compiled simulation of the same photons, and "
-        "with `simulate` as it is called outside of a transformation. Memory is that of temporaries.",
+        "with `simulate` as it is called outside of a transformation. Where voxels are empty, photons are "
+        "traced once more for what leaves there would scatter. Memory is that of temporaries.",
         table(head, rows),
     )
 

@@ -20,7 +20,8 @@ A flight has several ends. Each counts with its own deposit, and the selected on
 A group of photons is traced at a time, the smaller the more orders there are, so that memory is bounded.
 Path replay backpropagation (Vicini, Speierer and Jakob 2021, ACM Trans. Graph. 40, 108) keeps no flights. It
 traces photons twice more, and finds what comes after a flight as a difference, whose rounding would remain
-where a photon ends. Photons never collide where extinction is zero: such voxels get the lengths alone.
+where a photon ends. Photons never collide where extinction is zero: what would be scattered there is added by
+`jaxlidar.trace.empty_voxels`.
 """
 
 from typing import NamedTuple
@@ -36,6 +37,7 @@ from jaxlidar._vmapped_loops import any_problem, largest_count
 from jaxlidar.planning.config import Scatterer
 from jaxlidar.trace.deposit import take_rows
 from jaxlidar.trace.device_scene import DeviceScene
+from jaxlidar.trace.empty_voxels import EmptyVoxels, start_unplaced
 from jaxlidar.trace.higher_orders import (
     CHUNKS_PER_GROUP,
     PHOTONS_PER_CHUNK,
@@ -44,12 +46,9 @@ from jaxlidar.trace.higher_orders import (
     HigherOrderTally,
     Lanes,
     PhotonBatch,
-    collide_at_ends,
     empty_tally,
-    fly,
     is_deposited,
     returns_of_ends,
-    scatter,
 )
 from jaxlidar.trace.random_numbers import PhotonDraws
 from jaxlidar.trace.replay import ExtinctionTables
@@ -80,6 +79,7 @@ class KeptFlights(NamedTuple):
     - `cell`, `material`: voxel and material that each end collides with; the material is -1 if there is none,
       or if it is that of a surface. `end_x`: position of each end.
     - `deposits`: deposit of each end, times the cotangents of returns.
+    - `placed`: empty voxel that each end or the photon before was placed in (`jaxlidar.trace.empty_voxels`).
     """
 
     number: Int[Array, "*chunks photons"]
@@ -92,6 +92,7 @@ class KeptFlights(NamedTuple):
     material: Int[Array, "*chunks ends_photons"]
     end_x: Vec
     deposits: Float[Array, "*chunks ends photons"]
+    placed: Int[Array, "*chunks ends photons"]
 
     @staticmethod
     def empty(scene: DeviceScene, batch: PhotonBatch) -> "KeptFlights":
@@ -103,8 +104,9 @@ class KeptFlights(NamedTuple):
         by_end, cell = of_ends.reshape(chunks, n_ends, size), of_ends.astype(jnp.int32)
         number = jnp.full((chunks, size), batch.group_size)
         selected = jnp.zeros_like(number)
+        placed = cell.reshape(by_end.shape) - 1
         return KeptFlights(
-            number, vector, vector, by_end, of_photons, selected, cell, cell - 1, end_x, by_end
+            number, vector, vector, by_end, of_photons, selected, cell, cell - 1, end_x, by_end, placed
         )
 
     def with_chunk(self, place: Int[Array, ""], chunk: "KeptFlights") -> "KeptFlights":
@@ -126,6 +128,7 @@ def pull_back_higher_orders(
 
     1. Trace them again, and keep their flights with the deposits, times their cotangents.
     2. From the last chunk of flights to the first, add to the voxels.
+    3. If there are empty voxels, trace them once more, and add the deposits of those that are placed there.
     """
     medium, bins = scene.medium, scene.bins
     assert medium is not None
@@ -135,15 +138,18 @@ def pull_back_higher_orders(
     padded = jax.ShapeDtypeStruct(empty.weights.shape, empty.weights.dtype)
     # Trimming is linear: its transpose is applied once, to the cotangents.
     (of_returns,) = jax.linear_transpose(bins.trim, padded)((cotangent.weights, cotangent.outside))
+    empty_voxels = EmptyVoxels.of(scene)
 
-    def trace_group(total: ExtinctionTables, group: UInt32[Array, ""]) -> tuple[ExtinctionTables, None]:
+    def trace_group(number: Int[Array, ""], total: ExtinctionTables) -> ExtinctionTables:
+        # Photons of all groups are traced once as they are, and once more to be placed in empty voxels.
+        is_placing = number >= batch.n_groups
+        group = jnp.where(is_placing, number - batch.n_groups, number).astype(jnp.uint32)
         first_lane = batch.first_lane(group)
 
         def trace_chunk(in_chunk: Lanes, state: tuple[Array, KeptFlights], draws: PhotonDraws, order: Array):
             n_chunks, flights = state
             p = in_chunk.photons
-            flown, _ = fly(scene, p, empty, draws, order)
-            ends = collide_at_ends(scene, flown)
+            flown, ends, placed, onward = empty_voxels.trace_chunk(batch, in_chunk, draws, order, is_placing)
             in_voxel = ends.flights.collided & (ends.collision.surface < 0)
             chunk_flights = KeptFlights(
                 # Dead photons fill up chunks; the first of the group stands in for them (`compact`), whose
@@ -157,14 +163,17 @@ def pull_back_higher_orders(
                 cell=ends.flights.cell,
                 material=jnp.where(in_voxel, ends.collision.material, -1),
                 end_x=ends.x,
-                deposits=_deposits(scene, flown, ends, of_returns, order),
+                deposits=_deposits(empty_voxels.scene, flown, ends, of_returns, order),
+                placed=placed,
             )
-            p, _ = scatter(scene, flown, empty)
-            return Lanes(in_chunk.lane, p), (n_chunks + 1, flights.with_chunk(n_chunks, chunk_flights))
+            return onward, (n_chunks + 1, flights.with_chunk(n_chunks, chunk_flights))
 
         nothing = (jnp.zeros((), jnp.int32), KeptFlights.empty(scene, batch))
-        _, (n_chunks, group_flights) = batch.trace_orders(batch.send(group), nothing, trace_chunk)
+        lanes = start_unplaced(batch.send(group))
+        _, (n_chunks, group_flights) = batch.trace_orders(lanes, nothing, trace_chunk)
         n_chunks = largest_count(n_chunks)
+        # Of photons that are placed in empty voxels, nothing else counts.
+        n_chunks, n_placed = jnp.where(is_placing, 0, n_chunks), jnp.where(is_placing, n_chunks, 0)
 
         def add_chunk(n: Array, state: tuple[ExtinctionTables, Array]) -> tuple[ExtinctionTables, Array]:
             tables, later = state
@@ -180,11 +189,17 @@ def pull_back_higher_orders(
             from_start_on = jnp.sum(from_end_on, axis=0)
             return tables, later.at[flights.number].set(from_start_on, mode="drop")
 
-        later = jnp.zeros((batch.group_size,), of_returns.dtype)
-        return lax.fori_loop(0, n_chunks, add_chunk, (total, later))[0], None
+        def add_placed(n: Array, tables: ExtinctionTables) -> ExtinctionTables:
+            flights = group_flights.chunk(n)
+            return empty_voxels.add_to_tables(tables, flights.placed, flights.deposits)
 
+        later = jnp.zeros((batch.group_size,), of_returns.dtype)
+        total = lax.fori_loop(0, n_chunks, add_chunk, (total, later))[0]
+        return lax.fori_loop(0, n_placed, add_placed, total)
+
+    n_groups = jnp.where(any_problem(empty_voxels.are_empty), 2 * batch.n_groups, batch.n_groups)
     zero = jax.tree.map(jnp.zeros_like, ExtinctionTables.of(scene))
-    return lax.scan(trace_group, zero, jnp.arange(batch.n_groups, dtype=jnp.uint32))[0]
+    return lax.fori_loop(0, n_groups, trace_group, zero)
 
 
 def _deposits(

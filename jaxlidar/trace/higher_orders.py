@@ -24,7 +24,8 @@ materials, and the fraction of a chord at which a collision lies are held fixed;
 extinction move positions, path lengths and densities continuously, so that the expected value of the
 derivative is the derivative of the expected value. Photons that head for a surface are the exception: their
 directions move with voxel columns and terrain cells (`jaxlidar.trace.reparametrisation`). Photons never
-collide where the extinction coefficient is exactly zero: its derivative lacks what would scatter from there.
+collide where the extinction coefficient is exactly zero. What would scatter from there is added
+(`jaxlidar.trace.empty_voxels`).
 """
 
 import dataclasses
@@ -35,6 +36,7 @@ from typing import NamedTuple, TypeVar
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, UInt32
 
@@ -70,6 +72,8 @@ PHOTONS_PER_CHUNK = 256
 # Chunks that are traced together, order by order. Each group has its own sum: single precision loses small
 # deposits on a large sum.
 CHUNKS_PER_GROUP = 32
+# Numbers for each order of a photon by which `jaxlidar.trace.empty_voxels` scatters it.
+DRAWS_IN_EMPTY_VOXELS = 2
 
 
 class HigherOrderTally(eqx.Module):
@@ -108,10 +112,15 @@ class HigherOrderTally(eqx.Module):
 
 
 class Lanes(NamedTuple):
-    """Photons, and the number of each in its batch, which its random numbers depend on."""
+    """Photons, and the number of each in its batch, which its random numbers depend on.
+
+    - `empty_voxel`: the voxel of zero extinction where the photon was scattered, or -1
+      (`jaxlidar.trace.empty_voxels`); None outside of derivatives.
+    """
 
     lane: UInt32[Array, "*photons"]
     photons: Photons
+    empty_voxel: Int[Array, "*photons"] | None = None
 
 
 # Traces the photons of a chunk through one order, and adds to sums; its arguments are these two, the photons'
@@ -139,11 +148,12 @@ class PhotonBatch:
         n_photons = scene.config.n_photons if nodes is None else nodes.n_photons
         # The first two words shift the footprint of order one (`jaxlidar.trace.response`) from the same key.
         # The next two shift the disc from which photons start, and every order and dimension takes a step and
-        # a shift.
-        words = words[2:]
-        self.footprint_shift = to_unit(words[:2])
-        dimensions = PhotonDraws.dimensions(scene.n_plates)
-        self.lattices = shifted_lattices(words[2:], scene.config.order_steps, dimensions)
+        # a shift. The last ones are for derivatives alone.
+        orders, dimensions = scene.config.order_steps, PhotonDraws.dimensions(scene.n_plates)
+        _, shift, words, more_words = jnp.split(words, np.cumsum([2, 2, 2 * orders * dimensions]))
+        self.footprint_shift = to_unit(shift)
+        self.lattices = shifted_lattices(words, orders, dimensions)
+        self.lattices_of_empty_voxels = shifted_lattices(more_words, orders, DRAWS_IN_EMPTY_VOXELS)
         self.chunk_size = min(PHOTONS_PER_CHUNK, n_photons)
         n_chunks = -(-n_photons // self.chunk_size)
         # Groups are made equally large, so that the last one is not mostly padding.
@@ -154,7 +164,8 @@ class PhotonBatch:
     @staticmethod
     def n_words(scene: DeviceScene) -> int:
         """Return the number of random words that a batch takes."""
-        return 4 + 2 * scene.config.order_steps * PhotonDraws.dimensions(scene.n_plates)
+        dimensions = PhotonDraws.dimensions(scene.n_plates) + DRAWS_IN_EMPTY_VOXELS
+        return 4 + 2 * scene.config.order_steps * dimensions
 
     def first_lane(self, group: UInt32[Array, ""]) -> UInt32[Array, ""]:
         """Return the lane of the first photon of a group."""
@@ -405,13 +416,18 @@ def is_deposited(scene: DeviceScene, order: Int[Array, ""]) -> Bool[Array, ""]:
 
 
 def fly(
-    scene: DeviceScene, p: Photons, tally: HigherOrderTally, draws: PhotonDraws, order: Int[Array, ""]
+    scene: DeviceScene,
+    p: Photons,
+    tally: HigherOrderTally,
+    draws: PhotonDraws,
+    order: Int[Array, ""],
+    move_ends: Callable[[FlownPhotons], FlownPhotons] | None = None,
 ) -> tuple[FlownPhotons, HigherOrderTally]:
     """Let a chunk of photons fly, and tally the energy that arrives at plates on the way.
 
     1. Find the surfaces ahead, and sample which plates will stop the photon or let it pass.
     2. Sample the ends of the flight, one in each stratum of u, the transmittance up to the end. The photon
-       goes on from one of them.
+       goes on from one of them. `move_ends` may put them elsewhere.
     3. Apply the plates that the flight passes to weights and histories.
     """
     ends = scene.config.deposits_per_flight
@@ -451,6 +467,8 @@ def fly(
         u=u,
         max_length=max_length,
     )
+    if move_ends is not None:
+        flown = move_ends(flown)
     # Before deposits: these carry the history with the plates that their flight has passed.
     return _pass_plates(scene, flown, tally)
 

@@ -106,6 +106,7 @@ def with_replay(
     pull_back: Callable[[DeviceScene, Numbers, Traced], ExtinctionTables],
     scene: DeviceScene,
     numbers: Numbers,
+    add_tangents: Callable[[DeviceScene, Numbers, ExtinctionTables, Traced], Traced] | None = None,
 ) -> Traced:
     """Return `trace(scene, numbers)`, with derivatives with respect to extinction by `pull_back`.
 
@@ -113,6 +114,8 @@ def with_replay(
 
     - `trace`: traces light; `numbers` are random numbers and the like, without derivatives.
     - `pull_back`: returns the cotangents of extinction from those of the result of `trace`.
+    - `add_tangents`: adds to a tangent of the result of `trace` what that lacks, from tangents of extinction;
+      it has the transpose of `pull_back` with it. Default None: it lacks nothing.
 
     Scenes without voxels are traced as they are; so are those without derivatives or with forward ones alone,
     those with score functions, and those that vary along axes of a mesh.
@@ -129,11 +132,12 @@ def with_replay(
     def value(leaves: list[Array]) -> Traced:
         return trace(*scene_and_numbers(leaves, "none"))
 
+    # The position of every table among the leaves.
+    numbered: Any = eqx.combine(jax.tree.unflatten(treedef, range(len(leaves))), static)[0]
+    tables: Any = ExtinctionTables.of(numbered)
+
     def pull_back_leaves(leaves: list[Array], varying: list[int], cotangent: Traced) -> list[Array]:
         """Return the cotangents of leaves: of tables of extinction by the replay, of others by JAX."""
-        # The position of every table among the leaves.
-        numbered: Any = eqx.combine(jax.tree.unflatten(treedef, range(len(leaves))), static)[0]
-        tables: Any = ExtinctionTables.of(numbered)
         by_leaf: dict[int, Any] = {}
         if any(number in tables for number in varying):
             pulled = pull_back(*scene_and_numbers(leaves, "none"), cotangent)
@@ -166,7 +170,11 @@ def with_replay(
             def of_varying(values: list[Array]) -> Traced:
                 return trace(*scene_and_numbers(_replaced(leaves, varying, values), "forward"))
 
-            return jax.tree.leaves(jax.jvp(of_varying, ([leaves[i] for i in varying],), (tangents,))[1])
+            pushed = jax.jvp(of_varying, ([leaves[i] for i in varying],), (tangents,))[1]
+            of_tables = ExtinctionTables(*(dict(zip(varying, tangents)).get(i) for i in tables))
+            if add_tangents is not None and any(t is not None for t in of_tables):
+                pushed = add_tangents(*scene_and_numbers(leaves, "none"), of_tables, pushed)
+            return jax.tree.leaves(pushed)
 
         def transpose(leaves: list[Array], cotangents: list[Array]) -> list[Array]:
             return pull_back_leaves(leaves, varying, jax.tree.unflatten(result_structure, cotangents))

@@ -27,6 +27,7 @@ from jaxlidar._mesh_axes import vary_together, vary_with, with_automatic_axes
 from jaxlidar._products import einsum, tensordot
 from jaxlidar.planning.setup import Setup
 from jaxlidar.trace.device_scene import DeviceScene, build_device_scene
+from jaxlidar.trace.empty_voxels import add_tangents_of_empty_voxels
 from jaxlidar.trace.first_order import FirstOrder, first_order
 from jaxlidar.trace.first_order_replay import pull_back_first_order
 from jaxlidar.trace.footprint import ALL_RAYS, RaySlice, fibonacci_disc, product_rule
@@ -211,7 +212,9 @@ def trace_higher(scene: DeviceScene, key: PRNGKeyArray) -> HigherOrderTally:
     def trace(scene: DeviceScene) -> HigherOrderTally:
         # The same key as for the footprint: photons leave out the random words with which that is shifted.
         words = random_words(key, PhotonBatch.n_words(scene))
-        tally = with_replay(trace_photons, pull_back_higher_orders, scene, words)
+        tally = with_replay(
+            trace_photons, pull_back_higher_orders, scene, words, add_tangents=add_tangents_of_empty_voxels
+        )
         if scene.optics is None:
             return jax.tree.map(lambda a: a[None], tally)
         # Wavelengths, in place of histories, become traces with one history each.
