@@ -2,18 +2,20 @@ r"""Voxels of zero extinction in derivatives of orders two and above: what leaf 
 
 The derivative of a collision with respect to the extinction k of its voxel is the deposits from there on,
 over k (`jaxlidar.trace.higher_order_replay`). Where k is zero, photons never collide. There, collisions are
-placed on flights:
+placed on flights. With L the length of a flight within the voxels, and D(s) the deposits from a collision at
+s on,
 
-    dR/dk = E[ length of the flight * 1(empty) * deposits from there on ],
+    dR/dk = sum over orders of E[ integral_0^L 1(x(s) lies in an empty voxel) D(s) ds ].
 
-the mean over photons, their flights, and points that are uniform on the part of a flight within the voxels.
-No factor for the way to a point is missing: with that probability the flight gets there. 1(empty) is 1 where
-the point lies in a voxel of zero extinction; elsewhere the photon ends. This is the term of in-scattering of
-the differential transfer equation (Nimier-David, Mueller, Keller and Jakob 2022, ACM Trans. Graph. 41, 44).
+The transmittance up to s needs no factor: a flight reaches s with exactly that probability. This is the term
+of in-scattering of the differential transfer equation (Nimier-David, Mueller, Keller and Jakob 2022, ACM
+Trans. Graph. 41, 44). The integral is L times the integrand at a uniform point; a photon ends where that does
+not lie in an empty voxel. Of leaves that are not spherically oriented, k is multiplied by 2 G.
 
 Photons are traced once more for this. Each is placed at one of its orders n = 1, 2, ...: with the probability
 P = 1 / (n + 1) if it was not before, and P = 1 at the last one. Its weight is divided by P, or by 1 - P if it
-goes on without, so that weights grow slowly with orders. From there on it deposits as any photon does.
+goes on without. So a photon that is placed at order n has the weight n (n + 1): weights grow polynomially
+with n, not geometrically. From there on it deposits as any photon does.
 
 A voxel may be empty of leaf, of bark, or of both. `EmptyVoxels` lays out a second map behind the first one.
 Its extinction is 1 where that of the first one is 0, and 0 elsewhere: a collision there chooses the material.
@@ -136,7 +138,8 @@ class EmptyVoxels(NamedTuple):
 
         1. Choose these photons.
         2. A uniform point on the part of each flight that lies within the voxels.
-        3. The extinction k of the second map there: 0 ends the photon. The weight is the length times k / P.
+        3. The extinction k of the second map there: 0 ends the photon. The weight is the length times k / P,
+           and 1 / (1 - P) for photons that go on without.
         """
         scene, p, flights = self.scene, flown.p, flown.flights
         medium = scene.medium
@@ -151,7 +154,7 @@ class EmptyVoxels(NamedTuple):
         fraction = jnp.stack([position + i / n_ends for i in range(n_ends)])
         fraction = fraction - jnp.floor(fraction)
         to_ends = functools.partial(jnp.broadcast_to, shape=fraction.shape)
-        x, w, enter, leave, is_here = jax.tree.map(to_ends, (p.x, p.w, ray.enter, ray.leave, chosen))
+        x, w, enter, leave, is_placed_now = jax.tree.map(to_ends, (p.x, p.w, ray.enter, ray.leave, chosen))
         length = jnp.maximum(jnp.minimum(flights.distance, leave) - enter, 0.0)
         distance = enter + fraction * length
         point = lax.stop_gradient(along(x, w, distance))
@@ -162,16 +165,17 @@ class EmptyVoxels(NamedTuple):
         # The flight's own end remains a random decision: its density is attached, also the factor k of its
         # collision (`jaxlidar.trace.flight`), for second derivatives.
         k_of_end = jnp.where(flights.collided, medium.extinction(flights.cell, w), 1.0)
+        # The bound serves the last order alone, at which all are placed and P is 1.
         going_on = to_ends(jnp.where(undecided, 1.0 / jnp.maximum(1.0 - probability, 0.1), 1.0))
-        factor = jnp.where(is_here, length * k * attached_ratio(k_of_end) / probability, going_on)
+        factor = jnp.where(is_placed_now, length * k * attached_ratio(k_of_end) / probability, going_on)
         moved = dataclasses.replace(
             flights,
-            collided=jnp.where(is_here, length * k > 0.0, flights.collided),
-            landed=flights.landed & ~is_here,
-            late=flights.late & ~is_here,
-            escaped=flights.escaped & ~is_here,
-            cell=jnp.where(is_here, cell, flights.cell),
-            distance=jnp.where(is_here, distance, flights.distance),
+            collided=jnp.where(is_placed_now, length * k > 0.0, flights.collided),
+            landed=flights.landed & ~is_placed_now,
+            late=flights.late & ~is_placed_now,
+            escaped=flights.escaped & ~is_placed_now,
+            cell=jnp.where(is_placed_now, cell, flights.cell),
+            distance=jnp.where(is_placed_now, distance, flights.distance),
         )
         return moved, flown.weight * factor
 

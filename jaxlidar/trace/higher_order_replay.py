@@ -311,7 +311,8 @@ def _subtract_flights(
     amounts: Float[Array, "ends photons"],
 ) -> ExtinctionTables:
     """Subtract the lengths of flights up to their ends, times the amounts of these."""
-    ray = enter_grid(medium, flights.x, flights.w, scene.occupied_box)
+    # Not only in the box of occupied voxels: leaves in empty voxels around it would attenuate, too.
+    ray = enter_grid(medium, flights.x, flights.w)
     return _subtract_lengths(scene, tables, ray, flights.w, flights.targets, amounts, flights.max_distance)
 
 

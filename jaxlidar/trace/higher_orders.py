@@ -72,7 +72,8 @@ PHOTONS_PER_CHUNK = 256
 # Chunks that are traced together, order by order. Each group has its own sum: single precision loses small
 # deposits on a large sum.
 CHUNKS_PER_GROUP = 32
-# Numbers for each order of a photon by which `jaxlidar.trace.empty_voxels` scatters it.
+# Random numbers of each order for derivatives: whether to place the photon in an empty voxel, and where on
+# its flight (`jaxlidar.trace.empty_voxels`).
 DRAWS_IN_EMPTY_VOXELS = 2
 
 
@@ -427,7 +428,7 @@ def fly(
 
     1. Find the surfaces ahead, and sample which plates will stop the photon or let it pass.
     2. Sample the ends of the flight, one in each stratum of u, the transmittance up to the end. The photon
-       goes on from one of them. `move_ends` may put them elsewhere.
+       goes on from one of them. `move_ends` may move them and change their weights.
     3. Apply the plates that the flight passes to weights and histories.
     """
     ends = scene.config.deposits_per_flight

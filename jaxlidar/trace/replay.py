@@ -167,12 +167,18 @@ def with_replay(
         results, result_structure = jax.tree.flatten(result)
 
         def function(leaves: list[Array], tangents: list[Array]) -> list[Array]:
+            of_tables = ExtinctionTables(*(dict(zip(varying, tangents)).get(i) for i in tables))
+            has_tables = any(t is not None for t in of_tables)
+
             def of_varying(values: list[Array]) -> Traced:
-                return trace(*scene_and_numbers(_replaced(leaves, varying, values), "forward"))
+                scene, numbers = scene_and_numbers(_replaced(leaves, varying, values), "forward")
+                if has_tables:
+                    # Leaves in empty voxels around the box of occupied ones would attenuate, too.
+                    scene = dataclasses.replace(scene, occupied_box=None)
+                return trace(scene, numbers)
 
             pushed = jax.jvp(of_varying, ([leaves[i] for i in varying],), (tangents,))[1]
-            of_tables = ExtinctionTables(*(dict(zip(varying, tangents)).get(i) for i in tables))
-            if add_tangents is not None and any(t is not None for t in of_tables):
+            if add_tangents is not None and has_tables:
                 pushed = add_tangents(*scene_and_numbers(leaves, "none"), of_tables, pushed)
             return jax.tree.leaves(pushed)
 

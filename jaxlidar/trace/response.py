@@ -96,7 +96,8 @@ def trace_scene(setup: Setup, key: PRNGKeyArray, *, reverse: bool = True) -> Res
     - `setup`: a `Setup` made by `jaxlidar.make_setup`.
     - `key`: a JAX random key.
     - `reverse`: True if the function may be differentiated in reverse, as by `jax.grad`. Without, higher
-      orders are faster with JAX before 0.12. Default True.
+      orders are faster with JAX before 0.12, and their derivatives leave out what leaves in voxels of zero
+      extinction would scatter. Default True.
 
     **Returns:** a `Response`, for `jaxlidar.waveform_of`.
 

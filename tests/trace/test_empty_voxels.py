@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import jaxlidar as jl
+from jaxlidar.trace import higher_order_replay
 from jaxlidar.trace.device_scene import build_device_scene
 from jaxlidar.trace.empty_voxels import EmptyVoxels
 from tests.helpers import agrees
@@ -68,17 +69,17 @@ def problem(build, orders, zenith=12.0, wavelength=1064.0, n_photons=8192):
     return loss, plan
 
 
-def gradients(loss, material, voxels):
+def gradients(loss, material, voxels, tables=(LEAF, BARK)):
     """Return the gradient in some voxels, for each of some keys."""
-    start = [jnp.asarray(a, float) for a in (LEAF, BARK)]
+    start = [jnp.asarray(a, float) for a in tables]
     gradient = jax.jit(jax.grad(lambda *arguments: loss(*arguments), argnums=material))
     keys = jax.random.split(jax.random.key(3), N_KEYS)
     return np.asarray([np.asarray(gradient(*start, k), float)[tuple(voxels.T)] for k in keys])
 
 
-def differences(loss, material, voxels, n_keys):
+def differences(loss, material, voxels, n_keys, tables=(LEAF, BARK)):
     """Return one-sided differences of second order in some voxels, for each of some keys."""
-    start, value = [jnp.asarray(a, float) for a in (LEAF, BARK)], jax.jit(loss)
+    start, value = [jnp.asarray(a, float) for a in tables], jax.jit(loss)
 
     def with_extinction(voxel, k, key):
         tables = list(start)
@@ -124,6 +125,35 @@ def test_gradients_are_those_of_differences(name, build, material, options, monk
     monkeypatch.setattr(EmptyVoxels, "add_to_tables", lambda self, tables, placed, values: tables)
     attenuation = gradients(loss, material, voxels).mean(axis=0)
     assert not agrees(attenuation, stderr, expected, sigmas=5.0)
+
+
+@pytest.mark.slow
+def test_voxels_around_the_occupied_ones_attenuate(monkeypatch):
+    """Flights are followed in the box of occupied voxels alone; their derivatives are not."""
+    leaf = np.zeros_like(LEAF)
+    leaf[1, 1, 1] = 0.8
+    tables, voxels = (leaf, np.zeros_like(BARK)), np.array([(1, 1, 3), (1, 1, 0), (0, 1, 2)])
+    loss, _ = problem(leaf_and_bark, orders=4)
+    estimates = gradients(loss, 0, voxels, tables)
+    expected = differences(loss, 0, voxels, 3 * N_KEYS, tables)
+    stderr = np.sqrt(np.var(estimates, axis=0) / (N_KEYS - 1) + np.var(expected, axis=0) / (3 * N_KEYS - 1))
+    expected = expected.mean(axis=0)
+    assert agrees(estimates.mean(axis=0), stderr, expected, sigmas=3.5)
+    # Planted: flights attenuate nothing there.
+    monkeypatch.setattr(
+        higher_order_replay, "_subtract_flights", lambda scene, medium, tables, *arguments: tables
+    )
+    assert not agrees(gradients(loss, 0, voxels, tables).mean(axis=0), stderr, expected, sigmas=5.0)
+    start = [jnp.asarray(a, float) for a in tables]
+    direction = [
+        jnp.asarray(np.random.default_rng(5).normal(size=leaf.shape), float),
+        jnp.zeros_like(start[1]),
+    ]
+    monkeypatch.undo()
+    key = jax.random.key(1)
+    pushed = jax.jit(lambda t: jax.jvp(lambda *a: loss(*a, key), start, t)[1])(direction)
+    gradient = jax.jit(jax.grad(lambda *a: loss(*a, key)))(*start)
+    assert float(pushed) == pytest.approx(float(jnp.sum(gradient * direction[0])), rel=2e-4)
 
 
 @pytest.mark.slow
