@@ -62,6 +62,13 @@ def _explicit_mesh(arrays: Iterable[Any]) -> Any:
     return None
 
 
+def _depends_on_mesh(x: Any) -> bool:
+    """Return True for values that JAX traces, and for arrays that lie on a mesh with explicit axes."""
+    return isinstance(x, Tracer) or (
+        isinstance(x, jax.Array) and bool(jax.typeof(x).sharding.mesh.explicit_axes)
+    )
+
+
 def with_automatic_axes(function: Function) -> Function:
     """Return a function that leaves a mesh's explicit axes to the compiler.
 
@@ -71,7 +78,8 @@ def with_automatic_axes(function: Function) -> Function:
 
     @functools.wraps(function)
     def call(*args: Any, **kwargs: Any) -> Any:
-        arrays, static_arguments = eqx.partition((args, kwargs), eqx.is_array)
+        # Other arrays keep their values: as arguments of a program they would be traced.
+        arrays, static_arguments = eqx.partition((args, kwargs), _depends_on_mesh)
         mesh = _explicit_mesh(jax.tree.leaves(arrays))
         if mesh is None:
             return function(*args, **kwargs)

@@ -22,7 +22,7 @@ from jaxlidar._checks import (
     is_traced,
     is_within_program,
 )
-from jaxlidar._mesh_axes import with_automatic_axes
+from jaxlidar._mesh_axes import vary_with, with_automatic_axes
 from jaxlidar._progress import Progress
 from jaxlidar._summary import NOTABLE_FRACTION, late_fraction, percent, unfollowed_message
 from jaxlidar._threads import side_by_side
@@ -365,7 +365,7 @@ def _trace_transformed(tracer: BatchTracer, key: PRNGKeyArray) -> _BatchResults:
     # The sum is carried: responses of all batches together would take several times the memory.
     keys = jax.random.split(key, MIN_BATCHES)
     shapes = jax.eval_shape(trace_batch, keys[0])[0]
-    zero = jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), shapes)
+    zero = vary_with(jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), shapes), (tracer.scene, key))
     response_sum, (samples, terms) = jax.lax.scan(add_batch, zero, keys)
 
     def stderr(values: Array) -> Array:

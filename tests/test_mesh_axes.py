@@ -27,7 +27,9 @@ def scene_of(lad, hotspot=False):
     return jl.Scene(canopy=canopy, ground=GROUND, plates=(jl.Plate(2.5, 0.3, 0.2),))
 
 
-PLAN = jl.plan(LIDAR, scene_of(LADS[0]), n_photons=64, n_rays=64, max_orders=ORDERS)
+# Within a program the scene is made of traced arrays, also the heights of terrain that is a plane.
+EFFECTS = {"relief": True} if isinstance(scene_of(LADS[0]).ground, jl.Terrain) else None
+PLAN = jl.plan(LIDAR, scene_of(LADS[0]), n_photons=64, n_rays=64, max_orders=ORDERS, effects=EFFECTS)
 
 
 def simulated(lad, key=KEY):
@@ -54,6 +56,8 @@ keys = jax.random.split(KEY, 2)
 with jax.set_mesh(mesh):
     lads, keys = jax.device_put((jnp.asarray(LADS), keys), sharded)
     jax.eval_shape(one_per_device(simulated), lads)
+    if ONLY_VALUES:
+        raise SystemExit
     jax.eval_shape(one_per_device(simulated), lads, keys)
     jax.eval_shape(one_per_device(lambda key: simulated(LADS[0], key)), keys)
     jax.eval_shape(one_per_device(jax.grad(total)), lads)
@@ -94,8 +98,8 @@ np.testing.assert_allclose(jax.jit(total)(jax.device_put(LADS[0], sharded)), val
 TERRAIN = "jl.Terrain(np.linspace(0.0, 1.0, 100).reshape(10, 10), spacing=10.0, origin=(-45.0, -45.0))"
 
 
-def run_on_two_devices(code, axes, orders=1, zenith=0.0, ground="jl.Ground(slope=3.0)"):
-    settings = f"AXES, ORDERS, ZENITH = {axes!r}, {orders}, {zenith}\n"
+def run_on_two_devices(code, axes, orders=1, zenith=0.0, ground="jl.Ground(slope=3.0)", *, only_values=False):
+    settings = f"AXES, ORDERS, ZENITH, ONLY_VALUES = {axes!r}, {orders}, {zenith}, {only_values}\n"
     start = START.replace("ground=GROUND", f"ground={ground}")
     environment = os.environ | {
         "XLA_FLAGS": f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count=2",
@@ -104,6 +108,10 @@ def run_on_two_devices(code, axes, orders=1, zenith=0.0, ground="jl.Ground(slope
     arguments = [sys.executable, "-W", "ignore", "-c", settings + start + code]
     process = subprocess.run(arguments, env=environment, capture_output=True, text=True)
     assert process.returncode == 0, process.stderr[-2000:]
+
+
+def test_a_simulation_within_shard_map():
+    run_on_two_devices(WITHIN_SHARD_MAP, "Auto", orders=2, only_values=True)
 
 
 @pytest.mark.slow
