@@ -8,7 +8,7 @@ range of returns does not matter. Over ground, light that leaves the crown sidew
 away is late, and no record holds all of it. Differentiated is the light of all times together, as
 `prbvolpath` has no time, with respect to the extinction of every voxel; jaxlidar traces the waveform, and
 sums it. Both replay paths (Vicini, Speierer and Jakob 2021, ACM Trans. Graph. 40(4), 108). Empty voxels
-outside of the crown are left out of errors.
+outside of the crown are left out of errors; for their derivatives jaxlidar traces photons once more.
 
 The error of a gradient is the root of the summed variances of voxels, over that of their summed squared
 means. Seconds to 10 % = seconds * (error / 0.1)^2. A ratio is the time of the gradient, with the value, over
