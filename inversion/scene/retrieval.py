@@ -142,8 +142,8 @@ def retrieve_scene(
 
     Unknowns are of the scene, such as the leaf area density of every voxel, the height of every node of a
     terrain, a raster of reflectance, or leaf chemistry of each stratum, and of groups of shots: gains and
-    offsets. Gradients with respect to all voxels cost three to four simulations, however many voxels there
-    are; an empty voxel has one, too, so that leaves can appear where there were none.
+    offsets. Gradients with respect to all voxels cost a few simulations, however many voxels there are; an
+    empty voxel has one, too, so that leaves can appear where there were none.
 
     **What is determined.** A footprint averages over its own width: detail below it comes from footprints
     that overlap, with noise that grows quickly as detail becomes finer, and from the priors. Leaves in clumps

@@ -20,7 +20,7 @@ from jaxlidar.scenes.triangle_tree import ROW
 # Copies of a batch's response that are alive at once: sums of photons, of groups, and the result.
 _RESPONSE_COPIES = 3
 # Tangents of a response that are alive at once, for each column of a Jacobian. The sum of photons becomes the
-# result; newer compilers copy it in part, so that 1 to 1.7 were measured.
+# result, but newer compilers copy a part of it.
 _RESPONSE_TANGENTS = 1.3
 # Numbers of a photon, and of a ray segment, for each column of a score function.
 _SCORE_NUMBERS = 2

@@ -51,10 +51,10 @@ from jaxlidar.trace.higher_orders import (
 from jaxlidar.trace.photons import attached_ratio
 from jaxlidar.trace.random_numbers import PhotonDraws
 from jaxlidar.trace.replay import ExtinctionTables
-from jaxlidar.trace.voxel_traversal import Medium, cell_index, enter_grid
+from jaxlidar.trace.voxel_traversal import Medium, cell_index, enter_grid, voxel_at
 
-# Voxels in which ends of flights, or their photons before, were placed: the cell for leaf, the cell plus the
-# number of cells for bark, or -1.
+# Empty voxels in which ends of flights were placed, or their photons at an earlier order: the index of the
+# cell for leaf, that plus the number of cells for bark, or -1 for none.
 Placed = Int[Array, "ends photons"]
 
 
@@ -157,9 +157,7 @@ class EmptyVoxels(NamedTuple):
         x, w, enter, leave, is_placed_now = jax.tree.map(to_ends, (p.x, p.w, ray.enter, ray.leave, chosen))
         length = jnp.maximum(jnp.minimum(flights.distance, leave) - enter, 0.0)
         distance = enter + fraction * length
-        point = lax.stop_gradient(along(x, w, distance))
-        numbers = (jnp.floor((point[i] - medium.origin[i]) / medium.size[i]) for i in range(3))
-        voxel = tuple(number.astype(jnp.int32) for number in numbers)
+        _, voxel = voxel_at(medium, along(x, w, distance))
         cell = cell_index(medium, voxel) + self.n_cells
         k = medium.extinction(cell, w)
         # The flight's own end remains a random decision: its density is attached, also the factor k of its

@@ -24,8 +24,8 @@ materials, and the fraction of a chord at which a collision lies are held fixed;
 extinction move positions, path lengths and densities continuously, so that the expected value of the
 derivative is the derivative of the expected value. Photons that head for a surface are the exception: their
 directions move with voxel columns and terrain cells (`jaxlidar.trace.reparametrisation`). Photons never
-collide where the extinction coefficient is exactly zero. What would scatter from there is added
-(`jaxlidar.trace.empty_voxels`).
+collide where the extinction coefficient is exactly zero. Derivatives get what would scatter from there by
+`jaxlidar.trace.empty_voxels`.
 """
 
 import dataclasses
@@ -115,8 +115,8 @@ class HigherOrderTally(eqx.Module):
 class Lanes(NamedTuple):
     """Photons, and the number of each in its batch, which its random numbers depend on.
 
-    - `empty_voxel`: the voxel of zero extinction where the photon was scattered, or -1
-      (`jaxlidar.trace.empty_voxels`); None outside of derivatives.
+    - `empty_voxel`: the voxel of zero extinction where the photon was scattered, or -1, as `Placed` of
+      `jaxlidar.trace.empty_voxels`; None outside of derivatives.
     """
 
     lane: UInt32[Array, "*photons"]

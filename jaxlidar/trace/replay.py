@@ -10,7 +10,7 @@ nor with that of orders up to 256.
 
 `with_replay` gives a function that traces light this rule. Its derivatives are
 
-- forward: those of the function itself,
+- forward: those of the function itself, and what `add_tangents` adds,
 - reverse, with respect to extinction: by the replay,
 - reverse, with respect to everything else (heights, sizes, laws): those that JAX derives, chunk by chunk.
 """
@@ -114,8 +114,8 @@ def with_replay(
 
     - `trace`: traces light; `numbers` are random numbers and the like, without derivatives.
     - `pull_back`: returns the cotangents of extinction from those of the result of `trace`.
-    - `add_tangents`: adds to a tangent of the result of `trace` what that lacks, from tangents of extinction;
-      it has the transpose of `pull_back` with it. Default None: it lacks nothing.
+    - `add_tangents`: adds to a tangent of the result of `trace` what `pull_back` has and forward mode lacks,
+      from tangents of the tables of extinction. Default None: forward mode lacks nothing.
 
     Scenes without voxels are traced as they are; so are those without derivatives or with forward ones alone,
     those with score functions, and those that vary along axes of a mesh.
@@ -167,7 +167,8 @@ def with_replay(
         results, result_structure = jax.tree.flatten(result)
 
         def function(leaves: list[Array], tangents: list[Array]) -> list[Array]:
-            of_tables = ExtinctionTables(*(dict(zip(varying, tangents)).get(i) for i in tables))
+            by_leaf = dict(zip(varying, tangents))
+            of_tables = ExtinctionTables(*(by_leaf.get(number) for number in tables))
             has_tables = any(t is not None for t in of_tables)
 
             def of_varying(values: list[Array]) -> Traced:

@@ -23,7 +23,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxlidar._mesh_axes import vary_together
 from jaxlidar._one_function import once, one_function
-from jaxlidar._vectors import FAR, Scalar, Vec
+from jaxlidar._vectors import FAR, Scalar, Vec, vec
 from jaxlidar._vmapped_loops import any_problem
 from jaxlidar.optics.leaf_angles import ANGLE_NODES, LeafAngles
 from jaxlidar.optics.phase import AbstractPhase
@@ -447,19 +447,21 @@ def march_to_depths(
     )
 
 
+def voxel_at(medium: Medium, x: Vec) -> tuple[Vec, tuple[Int[Array, "*s"], ...]]:
+    """Return points in voxels from the lower corner of the map, and the voxel there, along each axis."""
+    position = vec((x[k] - medium.origin[k]) / medium.size[k] for k in range(3))
+    # Which voxel is a decision, without derivatives.
+    return position, tuple(jnp.floor(lax.stop_gradient(p)).astype(jnp.int32) for p in position)
+
+
 def voxel_above(medium: Medium, x: Vec) -> tuple[Int[Array, "..."], Scalar, Bool[Array, "..."]]:
     """Find the voxel at or straight above `x`, the fraction of it above `x`, and if there is one."""
-    voxel = []
-    position = []
-    for k in range(3):
-        p = (x[k] - medium.origin[k]) / medium.size[k]
-        position.append(p)
-        voxel.append(jnp.floor(lax.stop_gradient(p)).astype(jnp.int32))
+    position, voxel = voxel_at(medium, x)
     nx, ny, nz = medium.counts
     inside = voxel[2] < nz
     if not medium.periodic:
         inside &= (voxel[0] >= 0) & (voxel[0] < nx) & (voxel[1] >= 0) & (voxel[1] < ny)
-    cell = cell_index(medium, tuple(voxel))
+    cell = cell_index(medium, voxel)
     # Below the map the whole lowest voxel lies above the point; above the map, nothing.
     upper_face = (jnp.clip(voxel[2], 0, nz - 1) + 1).astype(position[2].dtype)
     above = jnp.clip(upper_face - jnp.maximum(position[2], 0.0), 0.0, 1.0)
