@@ -172,7 +172,7 @@ def _is_array_or_shape(x: Any) -> bool:
 class _Version:
     """One compiled version of a function, for arguments with given static parts.
 
-    - `result`: static part of the result, known once the function has been traced.
+    - `result`: static part of the result, once the function has been traced.
     - `result_shapes`: shapes of the result's arrays, once the version has been compiled ahead.
     - `is_compiled`: True once the version has been called.
     """
@@ -186,15 +186,19 @@ class _Version:
         options: dict[str, Any],
     ):
         """`types`: of the arrays of each argument. `settings`: of JAX. `options`: of `jax.jit`."""
-        self.result: Any = None
+        self._results: list[Any] = []
         self._lock = threading.Lock()
         self.path: Path | None = None
         self.identity = function, static_parts, types, settings, options
 
+        # Not `self`: the version would be part of a cycle, and its program freed at the next collection of
+        # garbage only, many programs later.
+        results = self._results
+
         def of_arrays(arrays: list[Any]) -> list[Any]:
             flat_result = _flatten(_call(function, static_parts, arrays))
             # A side effect of tracing: jax.jit returns arrays only.
-            self.result = flat_result.static
+            results[:] = [flat_result.static]
             return flat_result.arrays
 
         # The name that profiles and dumps of the compiler show.
@@ -204,6 +208,11 @@ class _Version:
         self.is_compiled = False
         self.result_shapes: Any = None
         self.compilation: Future | None = None
+
+    @property
+    def result(self) -> Any:
+        """Static part of the result."""
+        return self._results[0]
 
     def __call__(self, arrays: list[Any]) -> Any:
         if not self.is_compiled:
@@ -252,7 +261,7 @@ class _Version:
         if stored is None:
             return False
         flat_result = _flatten(stored.result)
-        self.result, self.result_shapes = flat_result.static, flat_result.arrays
+        self._results[:], self.result_shapes = [flat_result.static], flat_result.arrays
         self.compiled, self.is_compiled = stored.call, True
         return True
 

@@ -1,9 +1,11 @@
 """Compiled programs: one for each shape, a bounded number of them, shared by threads."""
 
 import concurrent.futures
+import gc
 import json
 import subprocess
 import sys
+import weakref
 
 import equinox as eqx
 import jax
@@ -58,6 +60,19 @@ def test_the_least_recently_used_programs_are_dropped():
     assert function.n_traces == 4
     program(jnp.zeros(2))
     assert function.n_traces == 5
+
+
+def test_dropped_programs_are_freed_at_once():
+    """Without a collection of garbage, which comes many programs later."""
+    program = Program(CountedFunction(), max_versions=1)
+    program(jnp.zeros(1))
+    version = weakref.ref(next(iter(program.versions.values())))
+    gc.disable()
+    try:
+        program(jnp.zeros(2))
+        assert version() is None
+    finally:
+        gc.enable()
 
 
 def test_bound_arguments_share_the_program():

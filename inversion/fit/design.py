@@ -91,6 +91,9 @@ _COARSE_TOLERANCE, _FINE_TOLERANCE, _NEAR_BEST = 0.1, 0.01, 1.5
 _NEAR_LOWEST = 4.0
 # Cost of a design that is not finite, such as one of two equal wavelengths; of its logarithm.
 _REJECTED_COST = 1e6
+# The optimiser ends where a step lowers the logarithm of the cost by less than so many roundings, relative to
+# it, or by less than the second number.
+_ROUNDINGS, _FINEST_TOLERANCE = 4.0, 2e-9
 
 Noise = ArrayLike | Callable[[Lidar, Array], Array] | None
 Cost = Callable[[CramerRao], Array]
@@ -285,6 +288,9 @@ class _DesignProblem(eqx.Module):
         self, fraction: np.ndarray, traced_scenes: list[TracedScene], lower: np.ndarray, upper: np.ndarray
     ) -> Any:
         """Minimise the logarithm of the mean cost from a start, between fractions of the limits."""
+        # The cost is as precise as JAX's default float: steps below its rounding are noise, in which the line
+        # search fails. In double precision it is the optimiser's own tolerance.
+        tolerance = max(_ROUNDINGS * float(jnp.finfo(jnp.result_type(float)).eps), _FINEST_TOLERANCE)
         return optimize.minimize(
             self.log_mean_cost,
             fraction,
@@ -292,7 +298,7 @@ class _DesignProblem(eqx.Module):
             jac=True,
             method="L-BFGS-B",
             bounds=np.stack([lower, upper], axis=1),
-            options={"maxiter": self.max_steps},
+            options={"maxiter": self.max_steps, "ftol": tolerance},
         )
 
     def limits_near(
