@@ -243,7 +243,7 @@ class SurveyModel:
             is_copy = (np.arange(size) >= len(chunk))[:, None, None]
             self.shots.append(
                 ShotChunk(
-                    geometry.as_arrays(),
+                    jax.tree.map(jnp.asarray, geometry.in_precision()),
                     jnp.asarray(observed[rows], float),
                     jnp.asarray(np.where(is_copy, 0.0, weight[rows]), float),
                     jnp.asarray(window, jnp.int32),

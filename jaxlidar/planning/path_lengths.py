@@ -460,13 +460,15 @@ def check_footprints_on_terrain(shots: Lidar | Survey, scene: Scene) -> None:
     origin, end, heights = concrete_array(ground.origin), ground.end, concrete_array(ground.heights)
     rims = footprint_rims(survey, _TERRAIN_RADII if survey.lidar.profile == "gaussian" else 1.0)
     # Rays that do not go down meet no ground: a tiny slope puts them far off the terrain.
-    downward = np.minimum(rims.rays[..., 2:], -1e-9)
+    downward = np.minimum(rims.rays[..., 2], -1e-9)
+    steps = [(z - rims.points[..., 2]) / downward for z in (heights.min(), heights.max())]
+    # Between the terrain's extreme heights all rays meet the ground. Coordinate by coordinate: NumPy reduces
+    # long rows many times faster than columns of two.
     ends = [
-        rims.points + rims.rays * (z - rims.points[..., 2:]) / downward
-        for z in (heights.min(), heights.max())
+        np.concatenate([rims.points[..., k] + rims.rays[..., k] * step for step in steps], axis=1)
+        for k in range(2)
     ]
-    # Between the terrain's extreme heights all rays meet the ground.
-    low, high = (f(np.concatenate(ends, axis=1)[..., :2], axis=1) + survey.position for f in (np.min, np.max))
+    low, high = (np.stack([f(e, axis=1) for e in ends], axis=1) + survey.position for f in (np.min, np.max))
     for i in np.flatnonzero(np.any((low < origin) | (high > end), axis=1)):
         position = survey.position[i]
         # Coordinates about the aim point, as those of the rim.

@@ -62,29 +62,37 @@ def check_relative_height(canopy: Canopy, ground: AbstractGround) -> None:
         # Columns beside the terrain have no height below them.
         low, high = np.asarray(concrete(ground.origin), float), ground.end
         over_x, over_y = ((low[k] <= v) & (v <= high[k]) for k, v in enumerate((x, y)))
-        x, y, extinction = x[over_x], y[over_y], extinction[np.ix_(over_x, over_y)]
+        if not (np.all(over_x) and np.all(over_y)):
+            x, y, extinction = x[over_x], y[over_y], extinction[np.ix_(over_x, over_y)]
     has_plants = extinction > 0
-    if not np.any(has_plants):
+    has_any = np.any(has_plants, axis=2)
+    if not np.any(has_any):
         return
     # Within a transformation that traces other parts of the scene, constants would be traced, too.
     with jax.ensure_compile_time_eval():
         surface = np.asarray(ground.height_at(*np.meshgrid(x, y, indexing="ij")), float)
     # Only voxels that lie below the terrain as a whole count: in a map that was lifted onto terrain, the
     # lowest voxel of a column is partly in the ground.
-    depth = surface[:, :, None] - (middles + 0.5 * size[2])
+    tops = middles + 0.5 * size[2]
+    # Depths of the lowest and the highest plants of each column.
+    deepest, shallowest = (
+        surface[has_any] - tops[level[has_any]]
+        for level in (np.argmax(has_plants, axis=2), nz - 1 - np.argmax(has_plants[:, :, ::-1], axis=2))
+    )
+    deepest, shallowest = float(deepest.max()), float(shallowest.min())
     # Rounding of single precision must not bury what lies on the terrain.
-    is_buried = has_plants & (depth > -1e-3 * size[2])
-    total = float(extinction[has_plants].sum(dtype=float))
-    buried = float(extinction[is_buried].sum(dtype=float)) / total
-    deepest, shallowest = float(depth[has_plants].max()), float(depth[has_plants].min())
-    if buried == 1.0:
+    least_depth = -1e-3 * size[2]
+    if shallowest > least_depth:
         raise ValueError(
             f"the canopy lies below the terrain, its top {shallowest:.3g} m deep: no light reaches "
             f"it; {_REMEDY}"
         )
-    if buried > NOTABLE_FRACTION:
-        bottom = deepest + float(size[2])
-        _warn(f"{percent(buried)} of the plants lie below the terrain, up to {bottom:.3g} m deep")
+    if deepest > least_depth:
+        is_buried = surface[:, :, None] - tops > least_depth
+        total, buried = (float(extinction.sum(where=w, dtype=float)) for w in (has_plants, is_buried))
+        if buried > NOTABLE_FRACTION * total:
+            bottom = deepest + float(size[2])
+            _warn(f"{percent(buried / total)} of the plants lie below the terrain, up to {bottom:.3g} m deep")
     elif (clearance := -deepest - float(size[2])) > MAX_CLEARANCE:
         _warn(f"the lowest plants are {clearance:.3g} m above the terrain")
 

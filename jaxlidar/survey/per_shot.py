@@ -36,7 +36,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
-from jaxlidar._checks import as_array
 from jaxlidar._programs import Program
 from jaxlidar._threads import ONE_CORE
 from jaxlidar._workers import WorkUnit, task
@@ -114,13 +113,15 @@ class ShotGeometry(NamedTuple):
     azimuth: Float[Array, "*shots"] | np.ndarray
     altitude: Float[Array, "*shots"] | np.ndarray | None
 
-    def as_arrays(self) -> "ShotGeometry":
+    def in_precision(self) -> "ShotGeometry":
         """Return the same in JAX's present precision."""
+        precision = jnp.result_type(float)
 
+        # Arrays of NumPy: compiled programs take them faster than JAX makes its own of each.
         def convert(a: Any) -> Any:
-            return None if a is None else as_array(a)
+            return None if a is None else np.asarray(a, precision)
 
-        return ShotGeometry(jnp.asarray(self.number), *map(convert, self[1:]))
+        return ShotGeometry(self.number, *map(convert, self[1:]))
 
 
 def shot_geometry(survey: Survey, first: int, count: int) -> ShotGeometry:
@@ -217,7 +218,9 @@ def trace_chunk(
     key: PRNGKeyArray,
 ) -> ShotResults:
     """Trace a chunk of shots."""
-    return compiled_shots(setup, shots.as_arrays(), key, jnp.asarray(rtol), kept_names, resolves_edges)
+    return compiled_shots(
+        setup, shots.in_precision(), key, np.asarray(rtol, jnp.result_type(float)), kept_names, resolves_edges
+    )
 
 
 class ShotBatch(NamedTuple):

@@ -129,7 +129,7 @@ class StrategyWithTruth(AbstractStrategy):
 def truths_of_chunk(setup: Setup, shots: ShotGeometry, key: PRNGKeyArray) -> Truths:
     """Return the truth of a chunk of shots; no random numbers are drawn."""
     # The truth is that of the first order with a fixed key: `key` is unused, as every task has one.
-    fields = _compiled_truths(first_order_setup(setup), shots.as_arrays())
+    fields = _compiled_truths(first_order_setup(setup), shots.in_precision())
     return Truths(**jax.tree.map(np.asarray, fields))
 
 

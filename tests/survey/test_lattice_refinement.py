@@ -184,7 +184,7 @@ def shots_of_a_tripod() -> jl.Survey:
 def test_parts_of_many_shots_are_those_of_single_ones(precision, shots_of):
     """Lattices that are traced together return what each returns alone; planted: that of another shot."""
     strategy = strategy_of(shots_of(), terrain_under(edge()))
-    setup, shots = strategy.setup, shot_geometry(strategy.survey, 0, 3).as_arrays()
+    setup, shots = strategy.setup, shot_geometry(strategy.survey, 0, 3).in_precision()
     n_rays, shifts = 8, jnp.asarray([[0.3, 0.8], [0.6, 0.1], [0.9, 0.5]])
     slices = RaySlice(jnp.asarray([0, 1, 2]), jnp.asarray([1, 3, 4]))
 
