@@ -152,7 +152,7 @@ def sample_tempered(
     )
     samples = []
     for island_key in jax.random.split(key, islands):
-        start_key, *keys = jax.random.split(island_key, 101)
+        start_key, end_key, *keys = jax.random.split(island_key, 102)
         uniform = jax.random.uniform(start_key, (particles, 2), minval=1e-6, maxval=1.0 - 1e-6)
         state = adaptive_tempered.init(jnp.log(uniform) - jnp.log1p(-uniform))
         for step_key in keys:
@@ -163,7 +163,9 @@ def sample_tempered(
             state, _ = kernel(step_key, state, 10, {"lengths": jnp.asarray(widening * scale)[None]})
         if float(state.tempering_param) < 1.0:
             raise RuntimeError(f"tempering has not come to its end in {len(keys)} steps")
-        samples.append(np.asarray(problem.density.to_natural(state.particles)["ground"]))
+        # Weights lead from the last power but one to the likelihood itself.
+        chosen = resampling.systematic(end_key, state.weights, particles)
+        samples.append(np.asarray(problem.density.to_natural(state.particles[chosen])["ground"]))
     return np.stack(samples)
 
 

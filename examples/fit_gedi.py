@@ -149,7 +149,7 @@ def row_of(fits, i, closed_forms):
         **{name: float(closed_forms[name]) for name in ("pai", "pai_stderr", "cover", "cover_stderr")},
         "slope": estimates["slope"],
         "slope_stderr": estimates["slope_stderr"],
-        **columns_of_canopy(CANOPY, fits.retrievals, fits.numbers[i], fits.verdicts[i]),
+        **columns_of_canopy(CANOPY, fits.retrievals, int(fits.numbers[i]), fits.verdicts[i]),
     }
 
 

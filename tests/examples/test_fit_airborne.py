@@ -159,15 +159,26 @@ def test_echoes_decide_which_scene_is_fitted(example, tmp_path, monkeypatch, cap
             values |= {"canopy height": np.full(n, 5.0), "log density": np.zeros((n, 10))}
         else:
             values |= {"receiver width": np.where(np.array([r.shot.index for r in records]) == 3, 3.0, 0.1)}
-        fits = argparse.Namespace(
+        errors = {name: np.full_like(v, 0.1) for name, v in values.items()}
+        n_values = sum(v[0].size for v in values.values())
+        fits = inversion.Retrievals(
             values=values,
-            robust_stderr={name: np.full_like(v, 0.1) for name, v in values.items()},
-            covariance=[0.01 * np.eye(sum(v[0].size for v in values.values()))] * n,
+            stderr=errors,
+            robust_stderr=errors,
             prior_share={},
+            at_bound={},
+            covariance=np.tile(0.01 * np.eye(n_values), (n, 1, 1)),
             reduced_chi2=np.ones(n),
+            second_minimum=np.ones(n),
+            independent_samples=np.ones(n),
+            averaging=np.zeros((n, n_values, n_values)),
+            strength={},
+            bounds={},
+            converged=np.ones(n, bool),
             steps=np.ones(n, int),
-            status=("converged",) * n,
             fitted=np.zeros((n, 1, time.size)),
+            status=("converged",) * n,
+            labels=("",) * n_values,
         )
         windows = [module.window_of(r, e[-1], time) for r, e in zip(records, echoes)]
         recorder = inversion.Recorder(width=(0.1, 5.0))
