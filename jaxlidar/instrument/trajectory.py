@@ -27,6 +27,7 @@ from jaxtyping import Float
 
 from jaxlidar._checks import as_numpy, check_range
 from jaxlidar._signatures import briefly
+from jaxlidar._text import number_text
 
 # Courses of two positions that are nearer to one another than this, m, are not defined.
 _LEAST_STEP = 1e-6
@@ -92,6 +93,14 @@ class Trajectory(eqx.Module):
     def __len__(self) -> int:
         return self.time.size
 
+    def __str__(self) -> str:
+        columns = [("time", self.time, "s"), *zip("xyz", self.position.T, "mmm")]
+        columns += [(name, getattr(self, name), "degrees") for name in ("roll", "pitch", "yaw")]
+        spans = ", ".join(
+            f"{name} {number_text(a.min())} to {number_text(a.max())} {unit}" for name, a, unit in columns
+        )
+        return f"Trajectory of {len(self):,} time{'s' * (len(self) != 1)}: {spans}"
+
     def at(self, time: Any) -> "Trajectory":
         """Return the trajectory at other times, between its own: linear in position and in each angle.
 
@@ -106,6 +115,8 @@ class Trajectory(eqx.Module):
         # Headings pass from 360 degrees to 0: unwrapped, neighbours are less than half a turn apart.
         columns = [*self.position.T, *(np.unwrap(a, period=360.0) for a in (self.roll, self.pitch, self.yaw))]
         x, y, z, roll, pitch, yaw = (np.interp(times, self.time, column) for column in columns)
+        # Unwrapped angles may exceed a turn, as 361 degrees after a heading of 359.
+        roll, yaw = np.fmod(roll, 360.0), np.fmod(yaw, 360.0)
         return Trajectory(times, np.stack([x, y, z], axis=-1), roll, pitch, yaw)
 
     @property

@@ -111,7 +111,10 @@ def read_trajectory(path: str | os.PathLike[str], *, crs: str | None = None) -> 
     if is_geographic:
         assert crs is not None
         values["x"], values["y"], turn = _projected(path, crs, values["longitude"], values["latitude"])
+    # 359.9 degrees from true north may be 361 from the map's.
     yaw = values["yaw"] - turn if "yaw" in values else None
+    if yaw is not None and is_geographic:
+        yaw = np.fmod(yaw, 360.0)
     position = np.stack([values[axis] for axis in "xyz"], axis=-1)
     try:
         return Trajectory(values["time"], position, values.get("roll", 0.0), values.get("pitch", 0.0), yaw)

@@ -144,9 +144,24 @@ def test_flight_lines_of_surveys_that_are_joined():
     assert numbered.gps_time is None
 
 
+def test_text_of_a_trajectory_states_its_ranges():
+    path = jl.Trajectory([3.2e8, 3.2e8 + 2.0], [(412345.25, 0, 500), (412345.25, 60, 500)], roll=[-1.5, 2.0])
+    assert str(path) == (
+        "Trajectory of 2 times: time 320000000 to 320000002 s, x 412345.25 to 412345.25 m, y 0 to 60 m, "
+        "z 500 to 500 m, roll -1.5 to 2 degrees, pitch 0 to 0 degrees, yaw 0 to 0 degrees"
+    )
+
+
 def test_headings_pass_through_north():
     path = jl.Trajectory([0.0, 2.0], [(0, 0, 1), (0, 1, 1)], yaw=[350.0, 10.0])
     np.testing.assert_allclose(path.at([1.0]).yaw % 360.0, 0.0)
+    # From 359 degrees the unwrapped heading passes 360.
+    for yaw in ([359.0, 1.0], [1.0, 359.0], [-359.0, -1.0]):
+        path = jl.Trajectory([0.0, 2.0], [(0, 0, 500), (0, 120, 500)], yaw=yaw)
+        middle = np.remainder(path.at([1.0]).yaw, 360.0)
+        assert min(middle[0], 360.0 - middle[0]) < 1e-9
+        survey = jl.Survey.fly(path, NADIR, lidar=jl.Lidar(altitude=500.0), pulse_rate=1.0)
+        np.testing.assert_allclose(survey.position, [(0, 0), (0, 60), (0, 120)], atol=1e-6)
     course = jl.Trajectory([0.0, 1.0, 2.0, 3.0], [(0, 0, 1), (1, 0, 1), (1, 0, 1), (1, 0, 1)])
     np.testing.assert_allclose(course.yaw, 90.0)
 

@@ -59,6 +59,11 @@ def test_longitude_and_latitude_are_projected_and_headings_turned(tmp_path):
     np.testing.assert_allclose(flight.yaw, [90.0, 90.0 - convergence], atol=1e-2)
     with pytest.raises(ValueError, match="give crs"):
         jaxlidar.io.read_trajectory(path)
+    # West of the meridian, headings near north are more than a turn from the map's.
+    path = written(tmp_path, "time,lon,lat,height,heading\n0,12,48,500,359.5\n1,12,48,500,0.5\n")
+    flight = jaxlidar.io.read_trajectory(path, crs="EPSG:32633")
+    expected = convergence + np.array([-0.5, 0.5])
+    np.testing.assert_allclose(np.remainder(flight.yaw, 360.0), expected, atol=1e-2)
 
 
 @pytest.mark.parametrize(
