@@ -453,6 +453,8 @@ def _group_into_shots(
     centred = packets.start - packets.start.mean(axis=0)
     step2 = np.sum(packets.direction**2, axis=1)
     along = np.sum(centred * packets.direction, axis=1) / step2
+    # Without a GPS time every packet is a shot, in the order of the file: the sort is stable.
+    along = np.where(packets.gps_time != 0, along, 0.0)
     order = np.lexsort((along, packets.channel, packets.source, packets.gps_time))
     start, direction, length, step, gps_time, source, channel = (field[order] for field in packets)
     between, step2 = np.diff(start, axis=0), step2[order][:-1]

@@ -980,20 +980,21 @@ def airborne_shots(
     returns: DiscreteReturns,
     crs: str | None,
 ) -> Iterator[AirborneShot]:
-    """Yield shots with their discrete returns and their record, in whole steps of the largest sample."""
+    """Yield shots with their discrete returns and their record, in whole steps of the largest sample.
+
+    Electronic noise may be negative: the offset of the digitiser is the lowest sample. It is the same for all
+    shots, as a LAS file has at most 255 descriptions of packets.
+    """
     largest = max(float(np.max(records[shots])) for shots in waves.chunks)
     if not largest > 0:
         raise ValueError("record has no sample above zero; admissible is one with light")
-    gain, start = largest / _FULL_INTENSITY, float(waves.time[0])
+    offset = min(0.0, *(float(np.min(records[shots])) for shots in waves.chunks))
+    gain, start = (largest - offset) / _FULL_INTENSITY, float(waves.time[0])
     first = np.searchsorted(returns.shot, np.arange(len(waves) + 1))
     intensity, classification = returns.intensity, returns.classification
     for i in range(len(waves)):
         rows = slice(first[i], first[i + 1])
-        # Electronic noise may be negative: the offset of the digitiser lies below it.
-        record = np.asarray(records[i], float)
-        offset = min(float(record.min()), 0.0)
-        counts = np.round((record - offset) / gain)
-        counts = counts.astype(np.uint32 if counts.max() > _FULL_INTENSITY else np.uint16)
+        counts = np.round((np.asarray(records[i], float) - offset) / gain).astype(np.uint16)
         time = waves.acquisition.gps_time[i]
         yield AirborneShot(
             index=i,

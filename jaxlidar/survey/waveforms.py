@@ -361,9 +361,9 @@ class Waveforms(eqx.Module):
         """Write waveforms and discrete returns as LAS 1.4 with waveform packets, in a .wdp file.
 
         A packet has all samples of a shot's record (`recorded`, or a `record` in `options`) in 65,535 steps
-        of the largest sample of the survey, and its gain turns them into J.
-        `jaxlidar.io.read_las_waveforms` reads them. A shot without a return gets a synthetic point, as
-        `jaxlidar.io.write_las_waveforms` states.
+        from zero, or the lowest sample of the survey if that is negative, to the largest; its gain and offset
+        turn them into J. `jaxlidar.io.read_las_waveforms` reads them. A shot without a return gets a
+        synthetic point, as `jaxlidar.io.write_las_waveforms` states.
 
         **Arguments:** `point_format`: 4, 5, 9 or 10. Default 9. The others are those of `to_las`; `path`
         ends in ".las".

@@ -95,6 +95,22 @@ def test_packets_have_the_samples_of_the_records(tmp_path, waveforms, point_form
         assert shot.scan_angle == pytest.approx(waveforms.acquisition.scan_angle[i], abs=0.51 * step)
 
 
+def test_noisy_records_of_many_shots_share_one_description_of_packets(tmp_path):
+    """The lowest samples of 300 noisy records all differ; a file has 255 descriptions of packets."""
+    survey = jl.Survey.grid(jl.Lidar(altitude=500.0), low=(0, 0), high=(29, 9), spacing=1.0)
+    waveforms = jl.simulate_many(survey, SCENE, key=jax.random.key(0), max_orders=1)
+    largest = waveforms.recorded.max()
+    noise = np.random.default_rng(0).normal(size=waveforms.recorded.shape)
+    record = waveforms.recorded + 0.02 * largest * noise
+    waveforms.to_las_waveforms(tmp_path / "noisy.las", record=record)
+    shots = jl.io.read_las_waveforms(tmp_path / "noisy.las")
+    assert len(shots) == 300
+    step = np.ptp(record) / 65535
+    # Without GPS times, shots are read in the order in which they were written.
+    for i in (0, 150, 299):
+        np.testing.assert_allclose(shots[i].waveform, record[i, 0], rtol=0, atol=0.51 * step)
+
+
 def test_formats_from_6_on_declare_well_known_text_without_a_system_too(tmp_path, waveforms):
     waveforms.to_las(tmp_path / "a.las")
     waveforms.to_las_waveforms(tmp_path / "b.las")
