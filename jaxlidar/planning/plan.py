@@ -330,7 +330,7 @@ def plan(
     # off, then what the user switches off. The table compares with everything else in place.
     empty_materials = find_empty_materials(scene, effects)
     scene = without_effects(lidar, scene, empty_materials)[1]
-    with_relief, scene = scene, replace_plane_terrain(scene, effects)
+    with_relief, scene = scene, replace_plane_terrain(lidar, scene, effects)
     flat_terrain = scene is not with_relief
     switches = effects or {}
     # Scattered light may go anywhere; of one order there are only the rays of the footprint.

@@ -129,6 +129,22 @@ def test_time_and_light_are_those_of_the_same_lidar_by_its_altitude():
     assert shift == pytest.approx(distance, abs=1e-3)
 
 
+@pytest.mark.parametrize("rise", [0.0, 0.3])
+def test_terrain_that_is_a_plane_ends_at_its_border(rise):
+    """From 60 m above the middle of 100 m, a beam 30 degrees off nadir meets it; one of 60 degrees does not."""
+    heights = rise * np.arange(101.0)[:, None] + np.zeros(101)
+    scene = jl.Scene(ground=jl.Terrain(heights, spacing=1.0, reflectance=0.4))
+    sensor = (50.0, 50.0, 60.0 + 50.0 * rise)
+    inside, outside = (look(sensor, zenith, 90.0, divergence=0.05) for zenith in (30.0, 60.0))
+    distance = 60.0 / (np.cos(np.deg2rad(30.0)) + rise * np.sin(np.deg2rad(30.0)))
+    assert mean_range(first_order(inside, scene)) == pytest.approx(distance, rel=1e-5)
+    assert total(first_order(outside, scene)) == 0.0
+    # A periodic plane goes on.
+    if rise == 0.0:
+        level = jl.Scene(ground=jl.Terrain(heights, spacing=1.0, reflectance=0.4, sides="periodic"))
+        assert total(first_order(outside, level)) == pytest.approx(0.2, rel=1e-4)
+
+
 # -- plants ------------------------------------------------------------------------------------------------
 
 
