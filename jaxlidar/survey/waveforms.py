@@ -236,8 +236,8 @@ class Waveforms(eqx.Module):
     ) -> DiscreteReturns:
         """Detect the discrete returns of all shots, as a laser scanner reports them.
 
-        `jaxlidar.survey.returns` states the detectors. All are calibrated: a flat target across the beam
-        has no error of range.
+        `jaxlidar.survey.returns` states the detectors. All are calibrated by the pulse: a smooth one leaves a
+        flat target across the beam an error of range of at most some per cent of a sample.
 
         **Arguments:**
 

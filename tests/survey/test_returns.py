@@ -50,6 +50,27 @@ def test_times_of_gaussian_echoes_are_exact_at_every_phase_of_the_samples(detect
     np.testing.assert_allclose(echoes.width, FWHM, rtol=0.01)
 
 
+@pytest.mark.parametrize("detector", DETECTORS)
+@pytest.mark.parametrize(
+    "pulse",
+    [
+        jl.ExponentiallyModifiedGaussianPulse(fwhm=3.0, decay=2.0),
+        jl.ExponentiallyModifiedGaussianPulse(fwhm=3.0, decay=0.5),
+        jl.GaussianPulse(fwhm=1.5),
+    ],
+)
+def test_times_of_skewed_and_of_short_pulses_have_no_walk_with_the_phase(detector, pulse):
+    """The interpolation between samples, which these pulses make worst, is calibrated at every phase."""
+    lidar = jl.Lidar(pulse=pulse)
+    times = 30.0 + np.arange(32) / 32.0
+    edges = np.arange(121.0) - 0.5
+    records = np.stack([np.diff(np.asarray(pulse.cumulative(edges - t, 0.0), float)) for t in times])
+    echoes = _find_echoes(detector, records, np.zeros((32, 1)), None, 0.5, sampled_pulse(lidar))
+    assert echoes.row.tolist() == list(range(32))
+    np.testing.assert_allclose(echoes.time, times, atol=0.015)
+    assert abs(np.mean(echoes.time - times)) < 1e-3
+
+
 def test_peaks_that_rise_less_than_the_threshold_above_the_dip_are_one():
     resolved, merged = gaussian_record((1.0, 40.0), (0.8, 49.0)), gaussian_record((1.0, 40.0), (0.8, 46.5))
     assert find("peak", resolved, merged).row.tolist() == [0, 0, 1]

@@ -131,7 +131,7 @@ def test_time_and_light_are_those_of_the_same_lidar_by_its_altitude():
 
 @pytest.mark.parametrize("rise", [0.0, 0.3])
 def test_terrain_that_is_a_plane_ends_at_its_border(rise):
-    """From 60 m above the middle of 100 m, a beam 30 degrees off nadir meets it; one of 60 degrees does not."""
+    """From 60 m above the middle of 100 m, a beam 30 degrees off nadir meets it, and one of 60 does not."""
     heights = rise * np.arange(101.0)[:, None] + np.zeros(101)
     scene = jl.Scene(ground=jl.Terrain(heights, spacing=1.0, reflectance=0.4))
     sensor = (50.0, 50.0, 60.0 + 50.0 * rise)
