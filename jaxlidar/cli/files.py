@@ -21,6 +21,7 @@ from jaxlidar.io import (
     read_obj,
     read_pulsewaves,
     read_qsm,
+    read_trajectory,
     read_vox,
     write_case,
     write_las_waveforms,
@@ -43,6 +44,8 @@ FILE_PATH = ResultPath(exists=True)
 MAX_DESCRIBED_SHOTS = 1000
 # A column that tables of cylinders have, in the first line of a file, and the longest such line in bytes.
 TREE_COLUMN, MAX_HEAD = re.compile(r"start_?x", re.IGNORECASE), 10_000
+# Columns that tables of positions and attitudes have.
+TRAJECTORY_COLUMN = re.compile(r"roll|pitch|yaw|heading|easting", re.IGNORECASE)
 
 
 # -- info --------------------------------------------------------------------------------------------------
@@ -173,10 +176,12 @@ def describe_spectrum(path: Path) -> str:
 
 
 def describe_csv(path: Path) -> str:
-    """Describe a table of cylinders by the names of its columns, otherwise a spectrum."""
+    """Describe a table of cylinders, or a trajectory, by the names of its columns, otherwise a spectrum."""
     with path.open("rb") as file:
         head = file.readline(MAX_HEAD).decode("utf-8", "replace")
-    return describe_tree(path) if TREE_COLUMN.search(head) else describe_spectrum(path)
+    if TREE_COLUMN.search(head):
+        return describe_tree(path)
+    return str(read_trajectory(path)) if TRAJECTORY_COLUMN.search(head) else describe_spectrum(path)
 
 
 def _spans(low: np.ndarray, high: np.ndarray) -> str:
@@ -214,7 +219,7 @@ def info(file: Path) -> None:
 
     Known are cases (.toml), results (.nc, .zarr), voxels (.vox), points (.las, .laz), airborne waveforms
     (.las with .wdp, .pls with .wvs, NEON's .npz), GEDI level 1B (.h5), tree models (.qsm, .txt, .csv), meshes
-    (.obj), elevation models (.tif, .tiff, .asc) and spectra (.csv).
+    (.obj), elevation models (.tif, .tiff, .asc), trajectories and spectra (.csv).
 
     \b
     Examples:

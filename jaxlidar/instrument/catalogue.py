@@ -193,7 +193,10 @@ def _table(name: str, path: str | os.PathLike[str] | None) -> dict[str, Any]:
     tables, chain = _tables(path), []
     while name is not None:
         if name not in tables:
-            nearest = difflib.get_close_matches(name, tables, n=3, cutoff=0.4) or list(tables)
+            # Without case, as "vq-780ii" is near to "RIEGL VQ-780 II".
+            names = {known.casefold(): known for known in tables}
+            matches = difflib.get_close_matches(name.casefold(), names, n=3, cutoff=0.4)
+            nearest = [names[match] for match in matches] or list(tables)
             raise ValueError(f"instrument {name!r} is not known; the nearest are {', '.join(nearest)}")
         if name in chain:
             raise ValueError(f"instrument {name!r} is like itself, by way of {', '.join(chain)}")

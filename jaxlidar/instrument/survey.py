@@ -199,8 +199,8 @@ class Survey(eqx.Module):
     def join(surveys: Any) -> "Survey":
         """Join surveys of one lidar, such as flight lines, into one.
 
-        **Arguments:** `surveys`: one or more `Survey`s whose lidars are equal, all placed by their sensors or
-        all by their altitude.
+        **Arguments:** `surveys`: one or more `Survey`s, all placed by their sensors or all by their altitude.
+        Their lidars are equal but for place and direction, which are those of the shots.
 
         **Returns:** a `Survey` of all shots in that order. `gps_time` and `scan_angle` are known where they
         are for all of the surveys, and `flight_line` is theirs; where one has none, it numbers the surveys
@@ -223,7 +223,7 @@ class Survey(eqx.Module):
             check_kind("surveys", survey, Survey, "a sequence of Survey")
         first = surveys[0]
         for number, survey in enumerate(surveys):
-            if not eqx.tree_equal(survey.lidar, first.lidar):
+            if not eqx.tree_equal(_at_place_of(first.lidar, survey.lidar), first.lidar):
                 raise ValueError(f"surveys: the lidar of survey {number} is not that of the first")
 
         def rows(name: str) -> np.ndarray | None:
@@ -600,6 +600,14 @@ def _place(lidar: Lidar, position: Any, altitude: Any, sensor: Any) -> Float[np.
             f"{field} has shape {positions.shape}; admissible is (shots, {size}), one shot or more"
         )
     return positions
+
+
+def _at_place_of(place: Lidar, lidar: Lidar) -> Lidar:
+    """Return a lidar in the place and direction of another; as it is where these are of different kinds."""
+    if lidar.has_sensor_position != place.has_sensor_position:
+        return lidar
+    fields = ("position", "altitude", "zenith", "azimuth")
+    return dataclasses.replace(lidar, **{name: getattr(place, name) for name in fields})
 
 
 def _of_kind(lidar: Lidar, has_sensors: bool) -> Lidar:

@@ -35,6 +35,11 @@ def no_compilation_cache(monkeypatch):
             "tree of 1 cylinders, 2.00 m tall",
         ),
         (
+            "flight.csv",
+            "GPSTime,Easting,Northing,Height,Roll,Pitch,Heading\n10,5,6,700,1,-2,90\n11,65,6,702,2,-1,90\n",
+            "Trajectory of 2 times: time 10 to 11 s, x 5 to 65 m, y 6 to 6 m, z 700 to 702 m",
+        ),
+        (
             "a.obj",
             "v 0 0 0\nv 2 0 1\nv 0 1 0\nusemtl leaf\nf 1 2 3\nf 1 1 2\n",
             "1 triangles: x 0.00 to 2.00 m, y 0.00 to 1.00 m, z 0.00 to 1.00 m\nleaf: 1.118 m2\n"

@@ -90,6 +90,7 @@ def test_users_add_instruments_of_their_own(tmp_path):
         ("[A.pulse]\nkind = 'Pulse'", "A.pulse.kind = 'Pulse' is none of GaussianPulse"),
         ("[A]\nlike = 'A'", "like itself"),
         ("[A]\nlike = 'GEDI'", "instrument 'GEDI' is not known; the nearest are GEDI"),
+        ("[A]\nlike = 'gedi power'", "the nearest are GEDI power,"),
         ("a = 1", "a is no table"),
         ("[A", "no TOML"),
     ],

@@ -144,6 +144,20 @@ def test_flight_lines_of_surveys_that_are_joined():
     assert numbered.gps_time is None
 
 
+def test_strips_at_several_altitudes_are_joined():
+    line = {"start": (0, 0), "end": (0, 10), "speed": 50.0, "pulse_rate": 10.0}
+    low, high = (jl.Survey.scan(jl.Lidar(altitude=h), NADIR, **line) for h in (500.0, 700.0))
+    joined = jl.Survey.join([low, high])
+    assert joined.altitude.tolist() == [500.0] * 3 + [700.0] * 3
+    assert [float(lidar.altitude) for lidar in joined] == joined.altitude.tolist()
+    for other in (jl.Lidar(altitude=500.0, divergence=1.0), jl.Lidar(sensor=(0.0, 0.0, 500.0))):
+        survey = jl.Survey(
+            other, **({"sensor": [(0, 0, 1)]} if other.altitude is None else {"position": [(0, 0)]})
+        )
+        with pytest.raises(ValueError, match="lidar of survey 1"):
+            jl.Survey.join([low, survey])
+
+
 def test_text_of_a_trajectory_states_its_ranges():
     path = jl.Trajectory([3.2e8, 3.2e8 + 2.0], [(412345.25, 0, 500), (412345.25, 60, 500)], roll=[-1.5, 2.0])
     assert str(path) == (
