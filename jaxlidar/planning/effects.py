@@ -91,11 +91,12 @@ def is_plane_terrain(ground: AbstractGround | None) -> bool:
 def replace_plane_terrain(lidar: Lidar, scene: Scene, effects: Mapping[str, bool] | None) -> Scene:
     """Return the scene with terrain that lies in a plane as a plane, unless `effects` asks for relief."""
     # A plane is met in closed form; the search for a ray's first crossing of a height field is not needed.
-    if not is_plane_terrain(scene.ground) or (effects or {}).get("relief") is True:
+    ground = scene.ground
+    if not is_plane_terrain(ground) or (effects or {}).get("relief") is True:
         return scene
     # Footprints of a lidar with an altitude lie on the terrain. A sensor sees past its border, where a plane
     # would go on.
-    if lidar.has_sensor_position and scene.ground.sides == "open":
+    if lidar.has_sensor_position and isinstance(ground, Terrain) and ground.sides == "open":
         return scene
     return without_relief(scene)
 
