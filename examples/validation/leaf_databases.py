@@ -62,7 +62,8 @@ def main(argv=None):
             ax.errorbar(chemistry, differences, 2 * error, fmt="o", ms=2, lw=0.5, color=COLOURS[0])
             ax.axhline(0.0, color="0.6", lw=0.8)
             within = np.mean(np.abs(differences) < 2 * error)
-            median = 100 * np.median(differences / chemistry)
+            is_present = chemistry > 0
+            median = 100 * np.median(differences[is_present] / chemistry[is_present])
             title = f"{name}:\n{trait}, {100 * within:.0f} % within 2 s.e., median {median:+.1f} %"
             ax.set_title(title, fontsize=8)
             ax.locator_params(axis="x", nbins=4)

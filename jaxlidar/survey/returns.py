@@ -16,8 +16,9 @@ With the sample times t_j and a record y(t) in J per sample, less its background
 level on its leading edge, interpolated between samples. What it reads of the pulse itself, scaled to the
 amplitude of the return and sampled at the same phase, is subtracted. Phases are tabulated in eighths of a
 sample, which leaves a flat target perpendicular to the beam an error of range of at most some per cent of a
-sample, where the pulse is smooth. What overlapping or broadened echoes add is the detector's error, as in
-instruments.
+sample, where the pulse is smooth, and of less than half a sample at the peak of a pulse of constant power.
+What overlapping or broadened echoes add is the detector's error, as in instruments. An echo that the window
+of the record cuts is placed at the end of the record.
 
 **Threshold.** If none is given, it is the larger of five standard deviations of the noise at the sample,
 and 1 % of the largest sample of the shot.
@@ -70,6 +71,11 @@ _RELATIVE_FLOOR = 1e-3
 _HYSTERESIS = 0.5
 # Samples below this fraction of the level that is crossed are raised to it before logarithms are taken.
 _LOGARITHM_FLOOR = 0.01
+# Background of noisy records: samples above the median by so many standard deviations are echoes; the
+# fraction of a normal distribution one standard deviation or more below its median; most rounds.
+_CLIPPING, _ONE_SIGMA_BELOW, _MAX_CLIPPINGS = 3.0, 0.15866, 20
+# Relative differences of the samples of a plateau: rounding, and the range, by which energy falls.
+_PLATEAU_DIFFERENCE = 1e-4
 # Samples that are worked on at once: arrays of less than a megabyte stay in a processor's cache.
 _SAMPLES_AT_ONCE = 100_000
 # Records that are decomposed together, by one compiled program; fewer are filled up with empty ones.
@@ -454,7 +460,7 @@ def _find_echoes(
         crossed = levels[peaks.row, (peaks.first % width) - 1 if levels.shape[1] > 1 else 0]
         position = _crossing(flat, peaks.first, -1, crossed, peaks.before, logarithmic=True)
         fraction = crossed / first_amplitude
-    position = _calibrated(position, _readings_of_pulse(detector, pulse, fraction))
+    position = _calibrated(detector, position, _readings_of_pulse(detector, pulse, fraction))
 
     floor = np.maximum(noise.max(axis=1), _RELATIVE_FLOOR * largest)
     start, end = _extents(padded, peaks, floor)
@@ -541,18 +547,26 @@ def _apex(flat: np.ndarray, peak: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     shift = np.clip(-slope / np.where(curvature < 0, curvature, -1.0), -0.5, 0.5)
     top = middle + 0.5 * slope * shift
     value = np.where(has_logarithm, np.exp(np.where(has_logarithm, top, 0.0)), top * centre)
-    # A saturated record repeats its largest value.
-    last = peak.copy()
-    growing = np.flatnonzero(after == centre)
-    while growing.size:
-        last[growing] += 1
-        growing = growing[flat[last[growing] + 1] == flat[peak[growing]]]
+    first, last = (_end_of_plateau(flat, peak, direction) for direction in (-1, 1))
     # Two equal samples lie on either side of an apex.
-    is_plateau = last > peak + 1
+    is_plateau = last > first + 1
     return (
-        np.where(is_plateau, 0.5 * (peak + last), peak + shift),
+        np.where(is_plateau, 0.5 * (first + last), peak + shift),
         np.where(is_plateau, centre, value),
     )
+
+
+def _end_of_plateau(flat: np.ndarray, peak: np.ndarray, direction: int) -> np.ndarray:
+    """Return the last samples in a direction (1 or -1) that are nearly as large as the maxima.
+
+    A saturated record repeats its largest value, and so does a pulse of constant power.
+    """
+    end, lowest = peak.copy(), flat[peak] * (1.0 - _PLATEAU_DIFFERENCE)
+    growing = np.flatnonzero(flat[peak + direction] >= lowest)
+    while growing.size:
+        end[growing] += direction
+        growing = growing[flat[end[growing] + direction] >= lowest[growing]]
+    return end
 
 
 def _crossing(
@@ -619,11 +633,21 @@ def _readings_of_pulse(detector: str, pulse: np.ndarray, fraction: Any) -> np.nd
     return np.maximum.accumulate(np.stack(readings), axis=0)
 
 
-def _calibrated(position: np.ndarray, readings: np.ndarray) -> np.ndarray:
+def _calibrated(detector: str, position: np.ndarray, readings: np.ndarray) -> np.ndarray:
     """Return the time zeros of echoes that a detector reads at `position`, in samples.
 
     Readings of the pulse by its phase are interpolated linearly. Those a sample later are a sample larger.
     """
+    latest = _latest_time_zero(position, readings)
+    if detector != "peak":
+        return latest
+    # The peak of a pulse with a flat top has one reading in several phases: the middle of these is taken. The
+    # earliest time is the latest where time runs backwards.
+    return 0.5 * (latest - _latest_time_zero(-position, 1.0 - readings[::-1]))
+
+
+def _latest_time_zero(position: np.ndarray, readings: np.ndarray) -> np.ndarray:
+    """Return the latest time zeros at which the pulse has the readings `position`, in samples."""
     whole = np.floor(position - readings[0])
     remainder = position - whole - readings
     # The last phase whose reading is not above that of the echo.
@@ -742,7 +766,7 @@ def _prepare_chunk(
         level = settings.background[shots, None]
         record = record - level.astype(record.dtype) if level.any() else record
     else:
-        record = record - np.median(record, axis=1, keepdims=True)
+        record = record - _median_beside_echoes(record)
     if settings.noise is not None:
         noise = settings.noise[shots].astype(record.dtype)
         noise = noise if noise.ndim == 2 else noise[:, None]
@@ -759,6 +783,25 @@ def _prepare_chunk(
         noise = 1.4826 / np.sqrt(2.0) * np.median(differences, axis=1, keepdims=True)
     threshold = None if settings.threshold is None else settings.threshold[shots]
     return record, noise, threshold
+
+
+def _median_beside_echoes(record: Float[np.ndarray, "shots samples"]) -> Float[np.ndarray, "shots 1"]:
+    """Return the median of the samples of each shot without its echoes.
+
+    Samples that exceed the median by `_CLIPPING` standard deviations are left out, and the median is taken
+    again, until it stays. The deviation is that of samples below the median, where no echo is.
+    """
+    ordered, shots = np.sort(record, axis=1), np.arange(len(record))
+    count = np.full(len(record), record.shape[1])
+    for _ in range(_MAX_CLIPPINGS):
+        median = 0.5 * (ordered[shots, (count - 1) // 2] + ordered[shots, count // 2])
+        # The quantile of a normal distribution that lies one standard deviation below its median.
+        deviation = median - ordered[shots, np.round(_ONE_SIGMA_BELOW * (count - 1)).astype(int)]
+        kept = np.count_nonzero(ordered <= (median + _CLIPPING * deviation)[:, None], axis=1)
+        if np.array_equal(kept, count):
+            break
+        count = kept
+    return median[:, None]
 
 
 def _energy_per_reflectance(waves: DetectorInput, shots: slice) -> Float[np.ndarray, "shots samples"]:

@@ -9,7 +9,7 @@ import pytest
 import inversion
 import jaxlidar as jl
 from jaxlidar.survey.acquisition import PULSE_OVERSAMPLING, sampled_pulse
-from jaxlidar.survey.returns import _find_echoes, position_along_beam
+from jaxlidar.survey.returns import _find_echoes, _median_beside_echoes, position_along_beam
 
 DETECTORS = ("peak", "constant fraction", "leading edge")
 STD = 3.0
@@ -69,6 +69,36 @@ def test_times_of_skewed_and_of_short_pulses_have_no_walk_with_the_phase(detecto
     assert echoes.row.tolist() == list(range(32))
     np.testing.assert_allclose(echoes.time, times, atol=0.015)
     assert abs(np.mean(echoes.time - times)) < 1e-3
+
+
+def test_a_flat_top_is_read_at_its_middle():
+    """Samples of a plateau differ by their rounding and range; the phase is known to half a sample then."""
+    pulse, times = jl.RectangularPulse(length=6.0), 30.0 + np.arange(32) / 32.0
+    edges, fall = np.arange(121.0) - 0.5, 1.0 - 3e-6 * np.arange(120)
+    records = np.stack([np.diff(np.asarray(pulse.cumulative(edges - t, 0.0), float)) for t in times])
+    for factor in (fall, fall[::-1]):
+        record = (records * factor).astype(np.float32)
+        echoes = _find_echoes(
+            "peak", record, np.zeros((32, 1)), None, 0.5, sampled_pulse(jl.Lidar(pulse=pulse))
+        )
+        assert echoes.row.tolist() == list(range(32))
+        np.testing.assert_allclose(echoes.time, times, atol=0.5)
+        assert abs(np.mean(echoes.time - times)) < 0.05
+
+
+def test_the_background_of_short_records_is_that_beside_their_echoes():
+    """Planted: the median of all samples, half of which belong to echoes."""
+    random, background, noise = np.random.default_rng(0), 0.1, 0.01
+    signal = gaussian_record((1.0, 14.0), (0.4, 38.0), samples=60)
+    records = background + signal + noise * random.normal(size=(400, 60))
+    median = _median_beside_echoes(records)
+    assert median.shape == (400, 1)
+    # Of some twenty samples beside the echoes.
+    assert abs(median.mean() - background) < 0.5 * noise
+    assert abs(np.median(records, axis=1).mean() - background) > 2 * noise
+    empty = background + noise * random.normal(size=(400, 60))
+    assert abs(_median_beside_echoes(empty).mean() - background) < 0.05 * noise
+    np.testing.assert_array_equal(_median_beside_echoes(np.zeros((2, 3))), 0.0)
 
 
 def test_peaks_that_rise_less_than_the_threshold_above_the_dip_are_one():
