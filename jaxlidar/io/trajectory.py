@@ -22,8 +22,6 @@ _NAMES = {
         "gpstimesow",
         "timesow",
         "sow",
-        "utctime",
-        "utcseconds",
         "secofweek",
     ),
     "x": ("x", "easting", "east", "e"),
@@ -38,7 +36,13 @@ _NAMES = {
 _REQUIRED = ("time", "z")
 # Units of times by their names in a header, in s.
 _SECONDS = {"": 1.0, "s": 1.0, "sec": 1.0, "seconds": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9}
-_SECONDS |= {"sow": 1.0, "gps": 1.0, "utc": 1.0}
+_SECONDS |= {"sow": 1.0, "gps": 1.0}
+# Names, followed by units, of times that are not GPS time: UTC differs from it by leap seconds, and seconds
+# of the day do not count the days of the week.
+_OTHER_TIME = re.compile(
+    r"utc|gmt|unix|posix|glonass|ofday|systemtime|pctime|local(time|sec)|tai(time|sec)|time(local|tai|sod|tod)"
+    r"|^(tai|sod|tod)$"
+)
 _NAME_AND_UNIT = re.compile(r"\s*(.*?)\s*([\[(][^\])]*[\])])?\s*$")
 # Half the length, m, of the line along the grid's north whose true direction is taken.
 _HALF_BASELINE = 50.0
@@ -59,8 +63,8 @@ def read_trajectory(path: str | os.PathLike[str], *, crs: str | None = None) -> 
 
     - `path`: a text file of comma-, semicolon-, tab- or space-separated values. Its first line that does not
       open with "#", or else the last one that does, names the columns, in any order and case, with spaces or
-      underscores, and with a unit in brackets where it is not the usual one: time (also GPSTime, SOW) in s;
-      x or easting, y or northing, and z, height or altitude in m; roll, pitch, and yaw or heading in
+      underscores, and with a unit in brackets where it is not the usual one: GPS time in s, as time, GPSTime
+      or SOW; x or easting, y or northing, and z, height or altitude in m; roll, pitch, and yaw or heading in
       degrees. Further columns are not read. Without roll and pitch these are zero; without yaw the platform
       heads along its course.
     - `crs`: a map's coordinate reference system in metres, such as "EPSG:32633". Columns longitude and
@@ -70,10 +74,11 @@ def read_trajectory(path: str | os.PathLike[str], *, crs: str | None = None) -> 
     **Returns:** a `Trajectory`, in the sense of roll, pitch and yaw that it states.
 
     **Raises:** FileNotFoundError where there is no such file. ValueError, naming the file and the line, for
-    columns that are missing, or that several columns may be; longitude and latitude without `crs`, and `crs`
-    without these; units that are not known; rows of another length, and cells that are not finite numbers;
-    coordinates that are not on Earth; and what a `Trajectory` refuses. ImportError where `crs` is given and
-    `rasterio`, of the extra `io`, is not installed.
+    columns that are missing, or that several columns may be; times that are UTC, local or of the day, unless
+    a column of GPS time is beside them; longitude and latitude without `crs`, and `crs` without these; units
+    that are not known; rows of another length, and cells that are not finite numbers; coordinates that are
+    not on Earth; and what a `Trajectory` refuses. ImportError where `crs` is given and `rasterio`, of the
+    extra `io`, is not installed.
 
     **Example:**
 
@@ -134,12 +139,13 @@ def _header(path: Path, lines: list[str]) -> tuple[int, str, dict[str, _Column]]
         lines[head] = lines[head].lstrip().lstrip("#")
     delimiter = max(",;\t ", key=lambda d: (lines[head].count(d) > 0, d != " ", lines[head].count(d)))
     names = [_NAME_AND_UNIT.match(cell) for cell in _cells(path, head + 1, lines[head], delimiter)]
+    other_times = [match[0].strip() for match in names if match is not None and _is_other_time(match)]
     columns = {}
     for quantity, known_names in _NAMES.items():
         matches = [
             (i, match[0].strip(), match[2])
             for i, match in enumerate(names)
-            if match is not None and re.sub(r"[\s_\-.]", "", match[1].lower()) in known_names
+            if match is not None and not _is_other_time(match) and _plain(match[1]) in known_names
         ]
         if len(matches) > 1:
             raise ValueError(
@@ -149,8 +155,23 @@ def _header(path: Path, lines: list[str]) -> tuple[int, str, dict[str, _Column]]
         if matches:
             index, name, unit = matches[0]
             columns[quantity] = _Column(index, name, _unit(f"{path}: line {head + 1}", quantity, name, unit))
+    if "time" not in columns and other_times:
+        raise ValueError(
+            f"{path}: line {head + 1}: {other_times[0]!r} is not GPS time; admissible is a column of GPS "
+            f"time, whose name may be {', '.join(_NAMES['time'])}"
+        )
     _check_columns(f"{path}: line {head + 1}", columns)
     return head, delimiter, columns
+
+
+def _plain(name: str) -> str:
+    """Return a name in lower case, without spaces, underscores, hyphens and dots."""
+    return re.sub(r"[\s_\-.]", "", name.lower())
+
+
+def _is_other_time(name_and_unit: re.Match[str]) -> bool:
+    """Return True for the name of a column of times that are not GPS time."""
+    return _OTHER_TIME.search(re.sub(r"[\[\]()]", "", _plain(name_and_unit[0]))) is not None
 
 
 def _cells(path: Path, line: int, text: str, delimiter: str) -> list[str]:

@@ -67,6 +67,23 @@ def test_longitude_and_latitude_are_projected_and_headings_turned(tmp_path):
 
 
 @pytest.mark.parametrize(
+    "column",
+    [
+        *("UTC", "UTC time", "utc_time", "UTCSeconds", "Time (UTC)", "time [UTC s]", "GMT", "Unix time"),
+        *("Local time", "time (local)", "Seconds of day", "Time_SOD", "TAI"),
+    ],
+)
+def test_times_that_are_not_gps_time_are_refused(tmp_path, column):
+    table = f"{column},x,y,z\n7,0,0,5\n8,10,0,5\n"
+    with pytest.raises(ValueError, match=r"flight\.csv: line 1: .*not GPS time; admissible is") as error:
+        jaxlidar.io.read_trajectory(written(tmp_path, table))
+    assert repr(column) in str(error.value)
+    # Beside a column of GPS time they are columns that are not read.
+    table = f"{column},GPSTime,x,y,z\n7,25,0,0,5\n8,26,10,0,5\n"
+    assert jaxlidar.io.read_trajectory(written(tmp_path, table)).time.tolist() == [25.0, 26.0]
+
+
+@pytest.mark.parametrize(
     ("text", "message"),
     [
         ("", "no row"),
