@@ -246,6 +246,7 @@ def write_case(path: str | os.PathLike[str], case: Case) -> None:
     **Arguments:**
 
     - `path`: the file to write, `NAME.toml`. The arrays, if there are any, go to `NAME.npz`.
+      Missing folders are created.
     - `case`: a `Case`.
 
     **Raises:** TypeError, naming the entry, for classes and functions of your own. ImportError where tomlkit

@@ -112,7 +112,7 @@ def write_gedi_l1b(
 
     **Arguments:**
 
-    - `path`: the HDF5 file to write. It appears when it is complete.
+    - `path`: the HDF5 file to write. It appears when it is complete. Missing folders are created.
     - `waveforms`: the `Waveforms` of `jaxlidar.simulate_many`, or one `Waveform` for each shot, of one
       wavelength and samples of 1 ns. Their `recorded` energies are written.
     - `survey`: the `Survey` that was simulated; `Survey.of(lidar)` for one waveform.

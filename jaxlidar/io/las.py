@@ -195,7 +195,7 @@ def write_las(
 
     **Arguments:**
 
-    - `path`: the file, which ends in ".las" or ".laz".
+    - `path`: the file, which ends in ".las" or ".laz". Missing folders are created.
     - `position`: (n, 3) m, at least one point. They are rounded to mm.
     - `intensity`: (n,) from 0 to 65535, rounded to whole numbers. Default None: 0.
     - `return_number`, `number_of_returns`: (n,) whole numbers from 0 to 15. Default None: 1.

@@ -494,7 +494,7 @@ def write_las_waveforms(
 
     **Arguments:**
 
-    - `path`: the .las file.
+    - `path`: the .las file. Missing folders are created.
     - `shots`: `AirborneShot`s, at least one, of one channel each, with samples that are whole and not
       negative.
     - `point_format`: 4, 5, 9 or 10. Default 9.

@@ -60,7 +60,8 @@ def save(result: Any, path: str | os.PathLike[str], case: Case | None = None) ->
 
     - `result`: a `Waveform`, or an object of any other class that `keep_as_netcdf` registered, such as
       `inversion.Retrieval` and `inversion.Retrievals`.
-    - `path`: the file to write, or the folder of a Zarr store, whose name ends in ".zarr".
+    - `path`: the file to write, or the folder of a Zarr store, whose name ends in ".zarr". Missing folders
+      are created.
     - `case`: the `Case` from which a waveform, or those of a survey, were simulated. It is written with them
       so that `jaxlidar.rerun` can simulate them again. Default None: not written.
 

@@ -36,7 +36,7 @@ def write_raster(
 
     **Arguments:**
 
-    - `path`: the file to write, .tif or .tiff.
+    - `path`: the file to write, .tif or .tiff. Missing folders are created.
     - `values`: (shots,) numbers by name, NaN or masked where there is none; each becomes a band of that name.
     - `position`: (shots, 2) x and y of the shots in m, or (shots, 3), of which z is not used, such as
       `Waveforms.ground_position`, in any order. Without `spacing` they lie on a grid along x and y, as those

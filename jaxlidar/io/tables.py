@@ -231,7 +231,7 @@ class ShotTable:
 
         GeoPackage has a point of longitude and latitude (WGS-84) for each row, and no row without.
 
-        **Arguments:** `path`: the file to write. It appears when it is complete.
+        **Arguments:** `path`: the file to write. It appears when it is complete. Missing folders are created.
 
         **Raises:** ValueError for another ending, and for a GeoPackage of a table without longitude and
         latitude. ImportError without the package that writes the format: xarray and h5netcdf of the extra

@@ -187,7 +187,7 @@ class DiscreteReturns(eqx.Module):
 
         **Arguments:**
 
-        - `path`: the file, which ends in ".las" or ".laz".
+        - `path`: the file, which ends in ".las" or ".laz". Missing folders are created.
         - `crs`: coordinate reference system of the scene, in metres, such as "EPSG:32633". Default None: not
           known. This needs rasterio.
 
@@ -206,6 +206,12 @@ class DiscreteReturns(eqx.Module):
         >>> print(cloud.position[:, 2].round(2), cloud.classification)
         [2.5 2.5] [2 2]
         """
+        if len(self) == 0:
+            raise ValueError(
+                f"{path}: the survey has no return to write: nothing in its {self.n_shots:,} shots reaches "
+                "the threshold; give a lower threshold to returns or to_las (min_reflectance to "
+                "true_returns), or write the waveforms with to_las_waveforms"
+            )
         write_las(
             path,
             self.position,

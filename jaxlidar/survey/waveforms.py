@@ -367,7 +367,7 @@ class Waveforms(eqx.Module):
         synthetic point, as `jaxlidar.io.write_las_waveforms` states.
 
         **Arguments:** `point_format`: 4, 5, 9 or 10. Default 9. The others are those of `to_las`; `path`
-        ends in ".las".
+        ends in ".las"; missing folders are created.
 
         **Returns:** the `DiscreteReturns` that were written.
 
@@ -407,7 +407,7 @@ class Waveforms(eqx.Module):
 
         **Arguments:**
 
-        - `path`: the file to write. It appears when it is whole.
+        - `path`: the file to write. It appears when it is complete. Missing folders are created.
         - `case`: the `jaxlidar.io.Case` of the survey that was simulated, so that `jaxlidar.rerun` can do it
           again. Default None: not kept.
 

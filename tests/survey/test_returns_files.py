@@ -134,11 +134,30 @@ def test_the_command_converts_waveforms_to_points(tmp_path, waveforms, capsys):
     assert cli.main(["convert", source, str(tmp_path / "a.toml"), "--crs", CRS]) == 2
 
 
+def test_writers_create_missing_folders_alike(tmp_path, waveforms):
+    for write, name in (
+        (waveforms.save, "a.nc"),
+        (waveforms.save, "a.zarr"),
+        (waveforms.to_las, "a.las"),
+        (waveforms.to_las_waveforms, "b.las"),
+    ):
+        path = tmp_path / f"folder of {name}" / "inner" / name
+        write(path)
+        assert path.exists()
+    # A refused file leaves none behind.
+    with pytest.raises(ValueError, match="has no return"):
+        waveforms.to_las(tmp_path / "empty" / "a.las", threshold=1.0)
+    assert not (tmp_path / "empty").exists()
+
+
 def test_what_a_file_cannot_hold_is_refused(tmp_path, waveforms):
     with pytest.raises(ValueError, match=r"does not end in \.las or \.laz"):
         waveforms.to_las(tmp_path / "strip.xyz")
-    with pytest.raises(ValueError, match="position holds no point"):
+    with pytest.raises(ValueError, match=r"strip\.las: the survey has no return .* a lower threshold"):
         waveforms.to_las(tmp_path / "strip.las", threshold=1.0)
+    # What the message names instead: shots without a return have a synthetic point.
+    waveforms.to_las_waveforms(tmp_path / "packets.las", threshold=1.0)
+    assert len(jl.io.read_las_waveforms(tmp_path / "packets.las")) == len(waveforms)
     with pytest.raises(ValueError, match="no sample above zero"):
         waveforms.to_las_waveforms(tmp_path / "strip.las", record=np.zeros_like(waveforms.recorded))
 
