@@ -10,7 +10,8 @@
     fwhm = {value = 3.5, source = "calibration sheet, 2024"}
 
 Keys are the arguments of `Lidar`, and `pulse_rate` in 1/s; tables with a `kind` are pulses, scan patterns
-and receivers. Each number has its `source`, or it is `assumed`, with the reason.
+and receivers. Each number has its `source`, or it is `assumed`, with the reason. A number alone, such as
+`aperture = 0.05`, is admissible in tables of the user's, and marked as without a source.
 """
 
 import difflib
@@ -45,13 +46,16 @@ _CLASSES: dict[str, Callable[..., Any]] = {
 }
 # Keys of an instrument that are no arguments of `Lidar`.
 _DESCRIPTION, _LIKE, _PULSE_RATE = "description", "like", "pulse_rate"
+# What `InstrumentValue.source` says of a number alone.
+_WITHOUT_SOURCE = "without a source"
 
 
 class InstrumentValue(NamedTuple):
     """A number of an instrument and its origin.
 
     - `value`: in the unit of the argument of `Lidar`, or of the class, that takes it.
-    - `source`: where it is published; for one that is not, the reason for the value that is assumed.
+    - `source`: where it is published; for one that is not, the reason for the value that is assumed, or
+      "without a source" where a table of your own states the number alone.
     - `is_published`: True if it is published.
 
     **Example:**
@@ -71,7 +75,8 @@ def instruments(path: str | os.PathLike[str] | None = None) -> tuple[str, ...]:
     """List the names of instruments, for `instrument`.
 
     **Arguments:** `path`: a TOML file with instruments of your own, as `jaxlidar/data/instruments.toml`,
-    whose names come in addition. Default None.
+    whose names come in addition. Numbers that it states alone, without a source, are admissible, and
+    `instrument_sources` marks them. Default None.
 
     **Returns:** the names.
 
@@ -130,7 +135,9 @@ def instrument_sources(name: str, path: str | os.PathLike[str] | None = None) ->
     **Arguments:** `name`, `path`: as for `instrument`.
 
     **Returns:** an `InstrumentValue` by the argument of `Lidar`, such as "energy", and by "pulse.fwhm" for
-    one of its pulse, scan or receiver; also "pulse_rate" in 1/s.
+    one of its pulse, scan or receiver; also "pulse_rate" in 1/s. Numbers that a table of your own states
+    without a source are not published, and their source is "without a source". Defaults of arguments that
+    the table leaves out are not listed.
 
     **Raises:** as `instrument`.
 
@@ -148,6 +155,9 @@ def _values(table: Mapping[str, Any], place: str, prefix: str = "") -> Any:
     """Yield the numbers of a table by their path."""
     for key, entry in table.items():
         if not isinstance(entry, Mapping):
+            # Texts, such as the description, and switches are no numbers.
+            if isinstance(entry, int | float | list) and not isinstance(entry, bool):
+                yield prefix + key, InstrumentValue(entry, _WITHOUT_SOURCE, False)
             continue
         if "kind" in entry:
             yield from _values(entry, f"{place}.{key}", f"{prefix}{key}.")

@@ -21,6 +21,7 @@ def test_an_instrument_is_a_lidar_and_each_number_has_its_source(name):
         if field != "pulse_rate":
             stored = lidar.pulse.fwhm if field == "pulse.fwhm" else getattr(lidar, field)
             assert float(np.max(stored)) == pytest.approx(value.value, rel=1e-6)
+    assert all(value.source != "without a source" for value in sources.values())
     # What a data sheet states is published, what it does not is marked.
     assert sources["pulse_rate"].is_published
     assert not sources["efficiency"].is_published
@@ -80,6 +81,24 @@ def test_users_add_instruments_of_their_own(tmp_path):
     assert jl.instrument("RIEGL VQ-780 II").noise is None
     assert float(lidar.divergence) == float(jl.instrument("RIEGL VQ-780 II").divergence)
     assert not jl.instrument_sources("My scanner", path)["receiver.electronic_noise"].is_published
+
+
+def test_numbers_without_a_source_are_listed_and_marked(tmp_path):
+    path = tmp_path / "mine.toml"
+    path.write_text(
+        '[A]\nlike = "RIEGL VQ-780 II"\ndescription = "ours"\nenergy = 2e-6\npulse_rate = 100000\n'
+        '[A.pulse]\nkind = "SampledPulse"\ntime = [0.0, 1.0, 2.0]\n'
+        'power = {value = [0, 1, 0], source = "x"}\n'
+    )
+    assert float(jl.instrument("A", path).energy) == pytest.approx(2e-6)
+    sources = jl.instrument_sources("A", path)
+    numbers = {"energy": 2e-6, "pulse_rate": 100000, "pulse.time": [0.0, 1.0, 2.0]}
+    marked = {name: value.value for name, value in sources.items() if value.source == "without a source"}
+    assert marked == numbers
+    assert not any(sources[name].is_published for name in numbers)
+    assert sources["pulse.power"].is_published
+    assert "description" not in sources
+    assert "pulse.kind" not in sources
 
 
 @pytest.mark.parametrize(
