@@ -5,6 +5,7 @@ import laspy
 import numpy as np
 import pytest
 
+import inversion
 import jaxlidar as jl
 from jaxlidar import cli
 
@@ -132,6 +133,21 @@ def test_the_command_converts_waveforms_to_points(tmp_path, waveforms, capsys):
     assert "point format 6, compressed" in output
     assert f"{2 * len(waveforms)} of pulses with 2" in output
     assert cli.main(["convert", source, str(tmp_path / "a.toml"), "--crs", CRS]) == 2
+
+
+def test_the_command_names_the_call_in_python_that_decomposes(tmp_path, waveforms, capsys, monkeypatch):
+    waveforms.save(tmp_path / "strip.nc")
+    source, target = str(tmp_path / "strip.nc"), str(tmp_path / "strip.laz")
+    assert cli.main(["convert", source, target, "--detector", "decomposition"]) == 2
+    message = " ".join(capsys.readouterr().err.split())
+    call = 'jaxlidar.open("strip.nc").to_las("strip.laz", detector="decomposition")'
+    assert f"import inversion, and {call}" in message
+    assert inversion.gaussian_decomposition is not None
+    monkeypatch.chdir(tmp_path)
+    eval(call, {"jaxlidar": jl})
+    assert len(laspy.read(target)) == 2 * len(waveforms)
+    assert cli.main(["convert", "--help"]) == 0
+    assert "after import inversion" in " ".join(capsys.readouterr().out.split())
 
 
 def test_writers_create_missing_folders_alike(tmp_path, waveforms):
