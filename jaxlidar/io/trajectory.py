@@ -3,7 +3,7 @@
 import os
 import re
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -68,17 +68,17 @@ def read_trajectory(path: str | os.PathLike[str], *, crs: str | None = None) -> 
       degrees. Further columns are not read. Without roll and pitch these are zero; without yaw the platform
       heads along its course.
     - `crs`: a map's coordinate reference system in metres, such as "EPSG:32633". Columns longitude and
-      latitude, on WGS 84, are projected to it, and headings, which are from true north, turned to the map's.
-      Default None: the file has x and y.
+      latitude, on WGS 84, are projected to it, and headings, which are from true north, turned to the map's;
+      so is a true heading beside x and y. Default None: the file has x and y, and headings are the map's.
 
     **Returns:** a `Trajectory`, in the sense of roll, pitch and yaw that it states.
 
     **Raises:** FileNotFoundError where there is no such file. ValueError, naming the file and the line, for
     columns that are missing, or that several columns may be; times that are UTC, local or of the day, unless
-    a column of GPS time is beside them; longitude and latitude without `crs`, and `crs` without these; units
-    that are not known; rows of another length, and cells that are not finite numbers; coordinates that are
-    not on Earth; and what a `Trajectory` refuses. ImportError where `crs` is given and `rasterio`, of the
-    extra `io`, is not installed.
+    a column of GPS time is beside them; longitude and latitude, or a true heading, without `crs`, and `crs`
+    without these; units that are not known; rows of another length, and cells that are not finite numbers;
+    coordinates that are not on Earth; and what a `Trajectory` refuses. ImportError where `crs` is given and
+    `rasterio`, of the extra `io`, is not installed.
 
     **Example:**
 
@@ -96,8 +96,16 @@ def read_trajectory(path: str | os.PathLike[str], *, crs: str | None = None) -> 
     is_geographic = "longitude" in columns
     if is_geographic and crs is None:
         raise ValueError(f"{location}: longitude and latitude; give crs, the map that they are projected to")
-    if crs is not None and not is_geographic:
-        raise ValueError(f"{location}: crs is given, but the columns are x and y; admissible is crs = None")
+    # A heading from true north beside longitude and latitude need not say so.
+    is_true = "yaw" in columns and "true" in _plain(columns["yaw"].name)
+    if is_true and crs is None:
+        name = columns["yaw"].name
+        raise ValueError(f"{location}: {name!r} is from true north; give crs, the map of x and y")
+    if crs is not None and not is_geographic and not is_true:
+        raise ValueError(
+            f"{location}: crs is given, but the columns are x and y, and no heading is named as one from "
+            "true north; admissible is crs = None"
+        )
     rows, numbers = [], []
     for number, text in enumerate(lines[head + 1 :], head + 2):
         if not text.strip() or text.lstrip().startswith("#"):
@@ -112,14 +120,13 @@ def read_trajectory(path: str | os.PathLike[str], *, crs: str | None = None) -> 
         if name in values and np.any(np.abs(values[name]) > MAX_COORDINATE):
             row = int(np.argmax(np.abs(values[name]) > MAX_COORDINATE))
             raise ValueError(f"{path}: line {numbers[row]}: {name} lies beyond {MAX_COORDINATE:g} m")
-    turn = 0.0
     if is_geographic:
         assert crs is not None
-        values["x"], values["y"], turn = _projected(path, crs, values["longitude"], values["latitude"])
-    # 359.9 degrees from true north may be 361 from the map's.
-    yaw = values["yaw"] - turn if "yaw" in values else None
-    if yaw is not None and is_geographic:
-        yaw = np.fmod(yaw, 360.0)
+        values["x"], values["y"] = _projected(path, crs, values["longitude"], values["latitude"])
+    yaw = values.get("yaw")
+    if yaw is not None and crs is not None:
+        # 359.9 degrees from true north may be 361 from the map's.
+        yaw = np.fmod(yaw - _direction_of_north(crs, values["x"], values["y"]), 360.0)
     position = np.stack([values[axis] for axis in "xyz"], axis=-1)
     try:
         return Trajectory(values["time"], position, values.get("roll", 0.0), values.get("pitch", 0.0), yaw)
@@ -217,8 +224,8 @@ def _value(path: Path, line: int, column: _Column, cells: list[str]) -> float:
 
 def _projected(
     path: Path, crs: str, longitude: Float[np.ndarray, " n"], latitude: Float[np.ndarray, " n"]
-) -> tuple[Any, Any, Any]:
-    """Return x and y on a map, m, and the direction of its north in degrees clockwise from true north."""
+) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+    """Return x and y on a map, m."""
     from rasterio.warp import transform
 
     projection = metric_system("crs", crs).crs
@@ -230,7 +237,18 @@ def _projected(
     x, y = map(np.array, transform("EPSG:4326", projection, longitude, latitude))
     if not np.all(np.isfinite(x) & np.isfinite(y)):
         raise ValueError(f"{path}: a position lies outside the projection {crs}")
+    return x, y
+
+
+def _direction_of_north(
+    crs: str, x: Float[np.ndarray, " n"], y: Float[np.ndarray, " n"]
+) -> Float[np.ndarray, " n"]:
+    """Return the direction of a map's north in degrees clockwise from true north."""
+    from rasterio.warp import transform
+
+    projection = metric_system("crs", crs).crs
     ends = [transform(projection, "EPSG:4326", x, y + side * _HALF_BASELINE) for side in (-1.0, 1.0)]
     (west, south), (east, north) = (map(np.array, end) for end in ends)
-    eastward = (np.remainder(east - west + 180.0, 360.0) - 180.0) * np.cos(np.deg2rad(latitude))
-    return x, y, np.rad2deg(np.arctan2(eastward, north - south))
+    latitude = np.deg2rad(0.5 * (south + north))
+    eastward = (np.remainder(east - west + 180.0, 360.0) - 180.0) * np.cos(latitude)
+    return np.rad2deg(np.arctan2(eastward, north - south))

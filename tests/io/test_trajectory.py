@@ -105,3 +105,23 @@ def test_times_that_are_not_gps_time_are_refused(tmp_path, column):
 def test_inadmissible_files(tmp_path, text, message):
     with pytest.raises(ValueError, match=message):
         jaxlidar.io.read_trajectory(written(tmp_path, text))
+
+
+def test_a_true_heading_is_turned_to_the_map_of_x_and_y(tmp_path):
+    """The same flight by longitude and latitude, and by their projection: without a map it is refused."""
+    pytest.importorskip("rasterio")
+    rows = "10,{},812.5,1.5,-2.0,359.5\n"
+    text = "GPSTime,Longitude,Latitude,Height,Roll,Pitch,Heading\n" + rows.format("12.0,52.0")
+    expected = jaxlidar.io.read_trajectory(written(tmp_path, text), crs="EPSG:32633")
+    assert abs(expected.yaw[0] - 359.5) > 2.0
+    x, y, _ = expected.position[0].tolist()
+    text = HEAD.replace("Heading", "True Heading") + "\n" + rows.format(f"{x!r},{y!r}")
+    path = written(tmp_path, text)
+    flight = jaxlidar.io.read_trajectory(path, crs="EPSG:32633")
+    np.testing.assert_allclose(flight.position, expected.position)
+    np.testing.assert_allclose(flight.yaw, expected.yaw, atol=1e-9)
+    with pytest.raises(ValueError, match="'True Heading' is from true north; give crs"):
+        jaxlidar.io.read_trajectory(path)
+    path = written(tmp_path, f"{HEAD}\n{ROWS}")
+    with pytest.raises(ValueError, match="no heading is named as one from"):
+        jaxlidar.io.read_trajectory(path, crs="EPSG:32633")
