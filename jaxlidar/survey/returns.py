@@ -645,7 +645,7 @@ def _calibrated(detector: str, position: np.ndarray, readings: np.ndarray) -> np
     Readings of the pulse by its phase are interpolated linearly. Those a sample later are a sample larger.
     """
     latest = _latest_time_zero(position, readings)
-    if detector != "peak":
+    if detector != "peak" or np.all(readings[1:] > readings[:-1]):
         return latest
     # The peak of a pulse with a flat top has one reading in several phases: the middle of these is taken. The
     # earliest time is the latest where time runs backwards.
