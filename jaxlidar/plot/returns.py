@@ -319,7 +319,9 @@ def _oblique_axes(
     ax.set_box_aspect(sides.tolist(), zoom=zoom)
     ax.set(xlabel="x, east (m)", ylabel="y, north (m)", zlabel="height (m)")
     ax.tick_params(labelsize="x-small")
-    for axis, side in zip((ax.xaxis, ax.yaxis, ax.zaxis), sides):
+    for axis, side, largest in zip((ax.xaxis, ax.yaxis, ax.zaxis), sides, high):
         axis.set_major_locator(MaxNLocator(nbins=max(round(4 * side / max(sides)), 1)))
+        # Labels of axes lie beyond those of ticks, of which map coordinates have six or seven digits.
+        axis.labelpad = 1.5 * len(f"{largest:.0f}")
     ax.ticklabel_format(style="plain", useOffset=False)
     return ax
