@@ -44,8 +44,9 @@ FILE_PATH = ResultPath(exists=True)
 MAX_DESCRIBED_SHOTS = 1000
 # A column that tables of cylinders have, in the first line of a file, and the longest such line in bytes.
 TREE_COLUMN, MAX_HEAD = re.compile(r"start_?x", re.IGNORECASE), 10_000
-# Columns that tables of positions and attitudes have.
-TRAJECTORY_COLUMN = re.compile(r"roll|pitch|yaw|heading|easting", re.IGNORECASE)
+# Columns that tables of positions and attitudes have, and those whose numbers are relative to true north.
+TRAJECTORY_COLUMN = re.compile(r"(?<![a-z])(roll|pitch|yaw|heading|easting)(?![a-z])", re.IGNORECASE)
+GEOGRAPHIC_COLUMN = re.compile(r"(?<![a-z])(lon|lng|long|longitude|true)(?![a-z])", re.IGNORECASE)
 
 
 # -- info --------------------------------------------------------------------------------------------------
@@ -181,7 +182,14 @@ def describe_csv(path: Path) -> str:
         head = file.readline(MAX_HEAD).decode("utf-8", "replace")
     if TREE_COLUMN.search(head):
         return describe_tree(path)
-    return str(read_trajectory(path)) if TRAJECTORY_COLUMN.search(head) else describe_spectrum(path)
+    if not TRAJECTORY_COLUMN.search(head):
+        return describe_spectrum(path)
+    if GEOGRAPHIC_COLUMN.search(head):
+        return (
+            "trajectory by longitude and latitude, or with a true heading: jaxlidar.io.read_trajectory needs "
+            "the crs= of a map"
+        )
+    return str(read_trajectory(path))
 
 
 def _spans(low: np.ndarray, high: np.ndarray) -> str:

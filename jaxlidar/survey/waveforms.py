@@ -247,8 +247,8 @@ class Waveforms(eqx.Module):
         - `record`: (shots, wavelengths, samples) J, one that `jaxlidar.record` gave, with its noise.
           Default None: `recorded`.
         - `background`: J per sample to subtract, not negative, one number or (shots,). Default None: what
-          the receiver adds to `energy`; with a `record`, the median of each shot's samples
-          that belong to no echo.
+          the receiver adds to `energy`; with a `record`, the median of each shot's samples that belong to
+          no echo.
         - `noise`: standard deviation of the record in J per sample, one number, (shots,) or (shots,
           samples). Default None: the standard error `stderr`; with a `record`, that of the differences of
           neighbouring samples.

@@ -40,6 +40,16 @@ def no_compilation_cache(monkeypatch):
             "Trajectory of 2 times: time 10 to 11 s, x 5 to 65 m, y 6 to 6 m, z 700 to 702 m",
         ),
         (
+            "world.csv",
+            "GPSTime,Longitude,Latitude,Height,Roll_deg,Pitch_deg,Heading\n10,12,52,700,1,-2,90\n",
+            "trajectory by longitude and latitude, or with a true heading: ",
+        ),
+        (
+            "leaf.csv",
+            "wavelength,controlled reflectance\n400,0.1\n500,0.2\n",
+            "spectrum 'leaf' of 2 samples from 400 to 500 nm",
+        ),
+        (
             "a.obj",
             "v 0 0 0\nv 2 0 1\nv 0 1 0\nusemtl leaf\nf 1 2 3\nf 1 1 2\n",
             "1 triangles: x 0.00 to 2.00 m, y 0.00 to 1.00 m, z 0.00 to 1.00 m\nleaf: 1.118 m2\n"
