@@ -42,6 +42,8 @@ class Flight(eqx.Module):
       the probability of no collision.
     - `depth_slopes`: derivatives of the optical depth flown with respect to parameters; None without
       score functions.
+    - `moved_w`: direction of flights whose landing points move (`jaxlidar.trace.reparametrisation`), equal to
+      that of the photons but for its derivative; None where none move.
     """
 
     collided: Bool[Array, "*photons"]
@@ -52,6 +54,11 @@ class Flight(eqx.Module):
     distance: Float[Array, "*photons"]
     ratio: Float[Array, "*photons"]
     depth_slopes: Float[Array, "ends parameters photons"] | None = None
+    moved_w: Vec | None = None
+
+    def direction(self, p: Photons) -> Vec:
+        """Direction of the flights of photons."""
+        return p.w if self.moved_w is None else self.moved_w
 
     @property
     def has_hit(self) -> Bool[Array, "*photons"]:

@@ -22,9 +22,10 @@ group are traced order by order, with living photons compacted before each order
 Derivatives: decisions are detached, their densities attached (`jaxlidar.trace.photons`). Directions,
 materials, and the fraction of a chord at which a collision lies are held fixed; voxel sizes, heights and
 extinction move positions, path lengths and densities continuously, so that the expected value of the
-derivative is the derivative of the expected value. Photons that head for a surface are the exception: their
-directions move with voxel columns and terrain cells (`jaxlidar.trace.reparametrisation`). Photons never
-collide where the extinction coefficient is exactly zero. Derivatives get what would scatter from there by
+derivative is the derivative of the expected value. Flights that land on a surface are the exception: their
+landing points move with voxel columns and terrain cells, and their directions with these
+(`jaxlidar.trace.reparametrisation`, with a list of the borders that matter). Photons never collide where the
+extinction coefficient is exactly zero. Derivatives get what would scatter from there by
 `jaxlidar.trace.empty_voxels`.
 """
 
@@ -58,7 +59,7 @@ from jaxlidar.trace.photons import Collision, CollisionForReturn, Photons, attac
 from jaxlidar.trace.random_numbers import PhotonDraws, random_words, shifted_lattices, to_unit
 from jaxlidar.trace.reparametrisation import (
     has_moving_landings,
-    landings_with_grids,
+    move_landings,
     rays_with_grids,
 )
 from jaxlidar.trace.score_functions import add_derivatives_of_returns, collision_score, vertical_depth_slopes
@@ -434,14 +435,6 @@ def fly(
     ends = scene.config.deposits_per_flight
     encounters = meet_surfaces(scene, p, draws.plates_ahead)
     max_length = detach(scene.longest_flight(p))
-    # Directions of photons that head for a surface are reparametrised, so that landings move with voxel
-    # columns and terrain cells: only so is the derivative complete where a landing may change from one to the
-    # next.
-    if has_moving_landings(scene):
-        heading = (order > 0) & (encounters.nearest_stop < max_length)
-        w, nearest_stop, ratio = landings_with_grids(scene, p, encounters, heading)
-        encounters = eqx.tree_at(lambda e: e.nearest_stop, encounters, nearest_stop)
-        p = eqx.tree_at(lambda p: (p.w, p.weight), p, (w, p.weight * ratio))
     # One number u says in which stratum the photon goes on, floor(u n), and where in each stratum its end
     # lies, the remainder: the ends (i + remainder) / n are stratified, and the selected one is u itself.
     selected = jnp.minimum(jnp.floor(draws.flight * ends), ends - 1)
@@ -449,6 +442,9 @@ def fly(
     # The logarithm of zero would be an infinite depth: depths end at -ln(1e-9) = 20.7.
     u = jnp.maximum(strata, 1e-9)
     flights = sample_flights(scene, p, encounters.nearest_stop, max_length, u)
+    # Rays of the first order move already (`rays_with_grids`).
+    if has_moving_landings(scene):
+        flights = move_landings(scene, p, encounters, flights, order > 0)
     # Optimisation barrier: flights serve several results, each of which would compute the march again.
     stops = (encounters.stops, encounters.nearest_stop, encounters.mesh_normal)
     p, draws, flights, stops = once((p, draws, flights, stops))
@@ -492,6 +488,7 @@ def scatter(
 
     # The collision is sampled again for the selected end: taking it from the deposits would keep the onward
     # directions of all ends alive.
+    p = dataclasses.replace(p, w=flight.direction(p))
     x, path, collision = collide(scene, p, flight, encounters, draws)
     weight = jnp.where(flight.has_hit, weight, 0.0)
     tally = tally.with_arrival(collision.material, index, weight)
@@ -597,8 +594,8 @@ def collide_at_ends(scene: DeviceScene, flown: FlownPhotons) -> FlightEnds:
     def flatten(tree):
         return jax.tree.map(lambda a: jnp.broadcast_to(a, (ends, a.shape[-1])).reshape(-1), tree)
 
-    p = dataclasses.replace(flown.p, score=None)
-    flights = dataclasses.replace(flown.flights, depth_slopes=None)
+    p = dataclasses.replace(flown.p, score=None, w=flown.flights.direction(flown.p))
+    flights = dataclasses.replace(flown.flights, depth_slopes=None, moved_w=None)
     p, flights, encounters, draws, index = flatten((p, flights, flown.encounters, flown.draws, flown.index))
     return FlightEnds(p, flights, draws, index, *collide(scene, p, flights, encounters, draws))
 

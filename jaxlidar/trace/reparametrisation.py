@@ -11,8 +11,23 @@ derivatives, and the factor p(T) |dT/du| is one in value, the attached ratio.
 
 The optical depth of a ray jumps where it crosses from one column of voxels to the next, the normal of terrain
 where its landing point crosses from one cell to the next. Therefore the rays of the footprint land at the
-same places among columns and cells (`rays_with_grids`), and so do photons that head for a surface
-(`landings_with_grids`).
+same places among columns and cells (`rays_with_grids`), and so do photons of higher orders that land on a
+surface (`move_landings`).
+
+Points must move with **every** border at which the integrand jumps, those of the domain of integration
+included; where they do not, the integrand must be continuous. For higher orders these are:
+
+- Collisions in the medium do not move: their direction is fixed, and so is the fraction of the chord at which
+  they lie within their voxel (`jaxlidar.trace.flight`). Where a path enters or leaves a voxel its chord grows
+  from zero, so that nothing jumps there.
+- Faces of columns and edges of terrain cells, for landings: points there move with them. The sides of a voxel
+  map and the edges of terrain are such faces, too.
+- The longest flight: beyond it nothing is recorded, and the response has fallen to zero before. Photons that
+  end in the medium must not take part in the motion of landings: they would carry a response that is not
+  zero across this border, and across the direction in which a surface ends.
+- The horizon of a surface: the density of landings, proportional to the cosine, falls to zero there.
+- The outlines of shapes and of meshes, and ridges that hide what lies behind them: not covered in higher
+  orders; derivatives lack the light that appears and disappears there.
 
 Points between two faces move as linear interpolation between the motions of these, whichever grids they
 belong to: with the faces at a and b and the fraction t = (u - a) / (b - a) held fixed,
@@ -37,6 +52,7 @@ add up to one: at each outline, and at each face, points move with it alone (as 
 Bangaru et al. 2020, ACM Trans. Graph. 39, 245).
 """
 
+import dataclasses
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -48,7 +64,6 @@ from jaxlidar._vectors import (
     FAR,
     Scalar,
     Vec,
-    add,
     along,
     dot,
     scale,
@@ -57,14 +72,18 @@ from jaxlidar._vectors import (
     with_derivative_of,
 )
 from jaxlidar.scenes.height_field import HeightField
+from jaxlidar.scenes.shapes import AbstractShape
 from jaxlidar.trace.device_scene import DeviceScene
-from jaxlidar.trace.flight import SurfaceEncounters
+from jaxlidar.trace.flight import Flight, SurfaceEncounters
 from jaxlidar.trace.footprint import Beam
 from jaxlidar.trace.photons import Photons, attached_ratio, detach
 from jaxlidar.trace.surfaces import TracedSurface
+from jaxlidar.trace.voxel_traversal import march_to_depths
 
 # Widths of columns or cells, and the position of one of their corners, m.
 Grid = tuple[Float[Array, "2"], Float[Array, "2"]]
+# A surface, and True for the photons that land on it.
+Target = tuple[AbstractShape, Bool[Array, "photons"]]
 
 # Faces of two grids that are nearer than this fraction of a cell are taken as one: the density of points
 # between them would change by its inverse.
@@ -82,10 +101,14 @@ def has_moving_landings(scene: DeviceScene) -> bool:
     return scene.derivatives != "none" and bool(scene.surfaces) and bool(_grids(scene))
 
 
-def landings_with_grids(
-    scene: DeviceScene, p: Photons, encounters: SurfaceEncounters, heading: Bool[Array, "photons"]
-) -> tuple[Vec, Scalar, Scalar]:
-    """Move the rays of photons towards surfaces as columns of voxels and cells of terrain move.
+def move_landings(
+    scene: DeviceScene,
+    p: Photons,
+    encounters: SurfaceEncounters,
+    flights: Flight,
+    may_move: Bool[Array, ""],
+) -> Flight:
+    """Move the points where photons land as columns of voxels and cells of terrain move.
 
     With the direction held fixed, landing points would cross from cell to cell. With the point held fixed
     between faces, rays that start just above the surface would have to turn without bound. So landing points
@@ -99,76 +122,103 @@ def landings_with_grids(
 
         1 + (1 - fade) (r - 1) + grad(fade) . (motion at a fixed direction - motion with the faces).
 
-    1. The landing point at a fixed direction, and the tangent plane there.
+    1. The landing point at a fixed direction.
     2. The landing point fixed between faces, and the ratio r: density of directions per area of the map.
-    3. The fade, as the product of those of all grids, and its gradient.
+    3. The fade and its gradient.
     4. The blend of both motions, and its ratio.
+    5. The transmittance of the path to the moved point, by a march of its own.
 
-    **Arguments:** `heading`: True for photons on their way to a surface.
+    **Arguments:** `may_move`: False for the first order, whose rays move already (`rays_with_grids`).
 
-    **Returns:** direction, distance to the nearest stop, and ratio, each with their derivative alone changed.
+    **Returns:** the flights; direction, distance and ratio of those that land have their derivative changed.
     """
-    grids = _grids(scene)
     assert p.last_scattering is not None
-    heading &= p.alive
-    distance = jnp.where(heading, encounters.nearest_stop, 1.0)
-    direct = along(p.x, p.w, distance)
-    landing = jax.tree.map(detach, direct)
-    normal, offset = vec(jnp.zeros_like(distance) for _ in range(3)), jnp.zeros_like(distance)
+    moves = may_move & p.alive & jnp.any(flights.landed, axis=0)
+    targets = []
     for surface, stop in zip(scene.surfaces, encounters.stops):
         is_target = stop <= encounters.nearest_stop
         if surface.shape is None:
             # A triangle may be vertical: it has no landing point for each column.
-            heading &= ~is_target
-            continue
-        surface_normal, surface_offset = surface.shape.tangent(direct)
-        normal = vec(jnp.where(is_target, n, m) for n, m in zip(surface_normal, normal))
-        offset = jnp.where(is_target, surface_offset, offset)
-    normal_z = jnp.where(heading, normal[2], 1.0)
+            moves &= ~is_target
+        else:
+            targets.append((surface.shape, is_target))
 
-    def on_surface(x, y):
-        z = (offset - normal[0] * x - normal[1] * y) / normal_z
-        return x, y, jnp.where(heading, z, direct[2])
+    def tangent(targets: list[Target], point: Vec) -> tuple[Vec, Scalar]:
+        offset = jnp.zeros_like(p.weight)
+        normal = (offset, offset, jnp.ones_like(offset))
+        for shape, is_target in targets:
+            shape_normal, shape_offset = shape.tangent(point)
+            normal = vec(jnp.where(is_target & moves, n, m) for n, m in zip(shape_normal, normal))
+            offset = jnp.where(is_target & moves, shape_offset, offset)
+        return normal, offset
 
-    def towards(point):
-        to_point = add(point, scale(p.x, jnp.asarray(-1.0)))
-        distance2 = jnp.maximum(dot(to_point, to_point), 1e-20)
-        return scale(to_point, 1.0 / jnp.sqrt(distance2)), jnp.sqrt(distance2)
+    distance = jnp.where(moves, encounters.nearest_stop, 1.0)
+    direct = along(p.x, p.w, distance)
+    landing = jax.tree.map(detach, direct)
 
-    place, widths = _between_faces(grids, landing)
-    fixed = on_surface(*place)
-    w, distance_to_fixed = towards(fixed)
+    (x, y), widths = _between_faces(_grids(scene), landing)
+    normal, offset = tangent(targets, (x, y, landing[2]))
+
+    def towards(x: Scalar, y: Scalar) -> tuple[Vec, Scalar]:
+        """Return direction and distance to the point of the surface at x and y near the landing point."""
+        z = (offset - normal[0] * x - normal[1] * y) / normal[2]
+        to_point = vec(jnp.where(moves, a - b, c) for a, b, c in zip((x, y, z), p.x, p.w))
+        distance = jnp.sqrt(jnp.maximum(dot(to_point, to_point), 1e-20))
+        return scale(to_point, 1.0 / distance), distance
+
+    w, distance_to_fixed = towards(x, y)
     # Per area of the map, onto which the sloping surface is projected; the last factor is |dT/du| of a point
     # that is fixed between faces, up to a constant.
     density = (
         scene.direction_density(p.last_scattering, w)
-        * jnp.abs(dot(normal, w) / normal_z)
+        * jnp.abs(dot(normal, w) / normal[2])
         / (distance_to_fixed * distance_to_fixed)
         * (widths[0] * widths[1])
     )
-    ratio = jnp.where(heading, attached_ratio(density), 1.0)
+    ratio = jnp.where(moves, attached_ratio(density), 1.0)
 
-    height_above = jnp.maximum(detach(distance * jnp.abs(dot(normal, p.w))), 1e-6)
-    fade, gradient = _fade(grids[0], landing, height_above)
-    for grid in grids[1:]:
-        # Product rule: the fade is zero at the faces of every grid.
-        next_fade, next_gradient = _fade(grid, landing, height_above)
-        fade, gradient = (
-            fade * next_fade,
-            tuple(g * next_fade + fade * m for g, m in zip(gradient, next_gradient)),
-        )
-    difference = [(direct[k] - landing[k]) - (fixed[k] - detach(fixed[k])) for k in range(2)]
-    blend_ratio = (
-        1.0 + (1.0 - fade) * (ratio - 1.0) + gradient[0] * difference[0] + gradient[1] * difference[1]
-    )
-    x, y = (landing[k] + (fixed[k] - detach(fixed[k])) + fade * difference[k] for k in range(2))
-    w, moved_distance = towards(on_surface(x, y))
+    fixed_scene, fixed_targets, start = jax.tree.map(detach, (scene, targets, p.x))
+
+    def fade_at(u: tuple[Scalar, Scalar]) -> Scalar:
+        # The tangent plane turns with u over terrain, and the height of the start above it with it.
+        normal, offset = tangent(fixed_targets, (*u, landing[2]))
+        height_above = jnp.maximum(jnp.abs(dot(normal, start) - offset), 1e-6)
+        fade = jnp.ones_like(u[0])
+        for to_face in _distances_from_faces(fixed_scene, (*u, landing[2])):
+            fade = fade * jnp.minimum(to_face / height_above, 1.0)
+        return fade
+
+    fade, gradient = _value_and_slopes(fade_at, (landing[0], landing[1]))
+    difference = [direct[k] - landing[k] - (a - detach(a)) for k, a in enumerate((x, y))]
+    ratio = 1.0 + (1.0 - fade) * (ratio - 1.0) + gradient[0] * difference[0] + gradient[1] * difference[1]
     # Values stay those that were drawn.
-    w = vec(with_derivative_of(a, jnp.where(heading, b, a)) for a, b in zip(p.w, w))
-    nearest_stop = encounters.nearest_stop
-    nearest_stop = with_derivative_of(nearest_stop, jnp.where(heading, moved_distance, nearest_stop))
-    ratio = with_derivative_of(jnp.ones_like(nearest_stop), jnp.where(heading, blend_ratio, 1.0))
-    return w, nearest_stop, ratio
+    w, distance = towards(*(a + fade * change for a, change in zip((x, y), difference)))
+    w = vec(with_derivative_of(a, jnp.where(moves, b, a)) for a, b in zip(p.w, w))
+    if scene.medium is not None:
+        path = march_to_depths(
+            scene.medium,
+            p.x,
+            w,
+            jnp.zeros((0, distance.size)),
+            with_derivative_of(encounters.nearest_stop, distance),
+            moves,
+            scene.config.max_faces,
+            scene.occupied_box,
+            reverse=scene.reverse,
+        )
+        ratio = ratio * jnp.exp(detach(path.total_depth) - path.total_depth)
+    lands = flights.landed & jnp.broadcast_to(moves, flights.landed.shape)
+
+    def moved(fixed: Scalar, changed: Scalar) -> Scalar:
+        fixed, changed = (jnp.broadcast_to(a, lands.shape) for a in (fixed, changed))
+        return with_derivative_of(fixed, jnp.where(lands, changed, fixed))
+
+    return dataclasses.replace(
+        flights,
+        moved_w=vec(moved(a, b) for a, b in zip(p.w, w)),
+        distance=moved(flights.distance, distance),
+        ratio=moved(flights.ratio, ratio),
+    )
 
 
 def _grids(scene: DeviceScene) -> list[Grid]:
@@ -177,23 +227,6 @@ def _grids(scene: DeviceScene) -> list[Grid]:
     grids = [] if medium is None else [(medium.size[:2], medium.origin[:2])]
     fields = [s.shape.heights for s in scene.surfaces if isinstance(s.shape, HeightField)]
     return grids + [(field.spacing, field.origin) for field in fields]
-
-
-def _fade(grid: Grid, point: Vec, height_above: Scalar) -> tuple[Scalar, tuple[Scalar, ...]]:
-    """Return the fraction of the motion at a fixed direction, and its derivatives with respect to x and y.
-
-    It rises linearly from zero at a face to one at the distance `height_above` from it.
-    """
-    size, origin = detach(grid[0]), detach(grid[1])
-    fades, slopes = [], []
-    for k in range(2):
-        in_cell = (point[k] - origin[k]) / size[k]
-        in_cell = in_cell - jnp.floor(in_cell)
-        to_face = jnp.minimum(in_cell, 1.0 - in_cell) * size[k]
-        fades.append(jnp.minimum(to_face / height_above, 1.0))
-        sign = jnp.where(in_cell < 0.5, 1.0, -1.0)
-        slopes.append(jnp.where(to_face < height_above, sign / height_above, 0.0))
-    return fades[0] * fades[1], (slopes[0] * fades[1], slopes[1] * fades[0])
 
 
 def has_moving_rays(scene: DeviceScene) -> bool:
