@@ -9,6 +9,7 @@ from collections.abc import Iterable
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jaxtyping import Array, Float
 
 Scalar = Float[Array, "..."]
@@ -29,7 +30,10 @@ def with_derivative_of(value: Scalar, differentiated: Scalar) -> Scalar:
 
     Where no derivatives are taken, `differentiated` is not used and the compiler drops its computation.
     """
-    return value
+    # The condition is a constant, so that the compiler sees that this is `value`. Under `jax.vmap` the result
+    # must have a batch axis where its derivative has one, even if `value` has none: JAX takes the axes from
+    # here alone, and within loops nothing corrects them.
+    return lax.select_n(np.False_, value, differentiated)
 
 
 @with_derivative_of.defjvp

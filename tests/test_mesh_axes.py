@@ -73,6 +73,35 @@ for value, lad in zip(values, LADS):
 """
 )
 
+# Several keys on each device, whose mean is that over all devices.
+KEYS_WITHIN_SHARD_MAP = """
+def mean(lad, keys):
+    return jnp.mean(jax.vmap(lambda key: simulated(lad, key).reflectance.sum())(keys))
+
+
+def mean_over_devices(lad, keys):
+    return jax.shard_map(
+        lambda lad, keys: jax.lax.pmean(mean(lad, keys), "shots"),
+        mesh=mesh, in_specs=(P(), P("shots")), out_specs=P(),
+    )(lad, keys)
+
+
+def derivatives(mean):
+    def gradient_and_tangent(lad, keys):
+        push = jax.jvp(lambda lad: mean(lad, keys), (lad,), (lad,))
+        return jax.grad(mean)(lad, keys), push
+
+    return gradient_and_tangent
+
+
+lad, keys = jnp.asarray(LADS[0]), jax.random.split(KEY, 4)
+on_two = jax.jit(derivatives(mean_over_devices))(lad, jax.device_put(keys, sharded))
+on_one = jax.jit(derivatives(mean))(lad, keys)
+for a, b in zip(jax.tree.leaves(on_two), jax.tree.leaves(on_one)):
+    np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-6)
+assert np.abs(on_one[0]).max() > 1e-3
+"""
+
 UNDER_VMAP = """
 lads = jax.device_put(jnp.asarray(LADS), sharded)
 for function in (simulated, jax.grad(total)):
@@ -112,6 +141,11 @@ def run_on_two_devices(code, axes, orders=1, zenith=0.0, ground="jl.Ground(slope
 
 def test_a_simulation_within_shard_map():
     run_on_two_devices(WITHIN_SHARD_MAP, "Auto", orders=2, only_values=True)
+
+
+@pytest.mark.slow
+def test_derivatives_of_many_keys_within_shard_map():
+    run_on_two_devices(KEYS_WITHIN_SHARD_MAP, "Auto", orders=2)
 
 
 @pytest.mark.slow

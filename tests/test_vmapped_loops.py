@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from jax import lax
 
+from jaxlidar._vectors import with_derivative_of
 from jaxlidar._vmapped_loops import any_problem, largest_count
 
 
@@ -51,3 +52,19 @@ def test_branches_on_shared_conditions_are_differentiated(transform):
 
     slopes = jax.jit(jax.vmap(transform(cube_where_positive)))(jnp.array([-1.0, 2.0]))
     np.testing.assert_allclose(slopes, [0.0, 12.0])
+
+
+@pytest.mark.parametrize("transform", [jax.grad, jax.jacfwd])
+def test_a_derivative_of_its_own_that_alone_depends_on_the_problem(transform):
+    # The value is the same for all problems, its derivative is not.
+    def mean_of_sums(x):
+        def sum_of_steps(factor):
+            def step(total, _):
+                return total + with_derivative_of(jnp.ones(()), factor * x), None
+
+            return lax.scan(step, jnp.zeros(()), length=2)[0]
+
+        return jnp.mean(jax.vmap(sum_of_steps)(jnp.array([1.0, 3.0])))
+
+    assert mean_of_sums(5.0) == 2.0
+    np.testing.assert_allclose(transform(mean_of_sums)(5.0), 4.0)

@@ -57,18 +57,35 @@ class SampleNoise(NamedTuple):
 
     def whiten(self, x: Float[np.ndarray, "samples ..."]) -> Float[np.ndarray, "samples ..."]:
         """Return differences, or columns of them, made independent and of unit variance."""
-        # Rows are samples; x may have any number of columns.
-        scaled = x / self.sigma_unshared.reshape(-1, *(1,) * (x.ndim - 1))
-        if self.shared_errors is None and self.correlation is None:
+        scaled = self._over_sigma(x)
+        if self._is_diagonal:
             return scaled
-        # Over sigma_unshared.
+        # Not finite differences, of a simulation that failed, pass through: the solver rejects them.
+        return linalg.solve_triangular(self._cholesky, scaled, lower=True, check_finite=False)
+
+    def times_precision(self, x: Float[np.ndarray, "samples ..."]) -> Float[np.ndarray, "samples ..."]:
+        """Return C^-1 times differences, or columns of them."""
+        whitened = self.whiten(x)
+        if not self._is_diagonal:
+            whitened = linalg.solve_triangular(self._cholesky, whitened, lower=True, trans=1)
+        return self._over_sigma(whitened)
+
+    @property
+    def _is_diagonal(self) -> bool:
+        return self.shared_errors is None and self.correlation is None
+
+    @property
+    def _cholesky(self) -> Float[np.ndarray, "samples samples"]:
+        """Cholesky factor of the covariance over sigma_unshared."""
         scaled_covariance = np.eye(self.sigma_unshared.size) if self.correlation is None else self.correlation
         if self.shared_errors is not None:
-            shared = self.shared_errors / self.sigma_unshared[:, None]
+            shared = self._over_sigma(self.shared_errors)
             scaled_covariance = scaled_covariance + shared @ shared.T
-        # Not finite differences, of a simulation that failed, pass through: the solver rejects them.
-        cholesky = np.linalg.cholesky(scaled_covariance)
-        return linalg.solve_triangular(cholesky, scaled, lower=True, check_finite=False)
+        return np.linalg.cholesky(scaled_covariance)
+
+    def _over_sigma(self, x: Float[np.ndarray, "samples ..."]) -> Float[np.ndarray, "samples ..."]:
+        # Rows are samples; x may have any number of columns.
+        return x / self.sigma_unshared.reshape(-1, *(1,) * (x.ndim - 1))
 
 
 def neighbour_correlation(

@@ -203,3 +203,29 @@ class CompletedFit(NamedTuple):
 
     summary: FitSummary
     details: FitDetails
+
+    @staticmethod
+    def of_zeros(sizes: SummarySizes, *, status: str) -> "CompletedFit":
+        """Return a fit whose numbers are all zero: the shapes and kinds of one."""
+        quantities: dict[str, Any] = {"status": status}
+        for field in dataclasses.fields(FitSummary):
+            shape = [getattr(sizes, axis) for axis in field.metadata["axes"]]
+            # As the code of a type, "b" would be an integer.
+            kind = field.metadata["kind"]
+            zeros = np.zeros(shape, bool if kind == "b" else kind)
+            quantities.setdefault(field.name, zeros if zeros.ndim else zeros.item())
+        record = np.zeros((sizes.wavelengths, sizes.bins))
+        nothing = np.zeros(0)
+        details = FitDetails(
+            simulation_error=np.zeros(sizes.unknowns),
+            residuals=record,
+            waveform_stderr=record,
+            cost=0.0,
+            prior_cost=0.0,
+            difference=nothing,
+            deviations=None,
+            noise=SampleNoise(nothing),
+            history=(),
+            evaluation=Evaluation(record, record[..., None], None, None),
+        )
+        return CompletedFit(FitSummary(**quantities), details)

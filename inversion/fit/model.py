@@ -408,6 +408,11 @@ class Evaluation(NamedTuple):
     is_pilot: bool = False
 
 
+def batch_keys(plan: Plan, key: PRNGKeyArray) -> list[PRNGKeyArray]:
+    """Return the random keys of the batches of an evaluation: one without random numbers, which is exact."""
+    return [jax.random.fold_in(key, n) for n in range(N_BATCHES if plan.is_random else 1)]
+
+
 def check_position(lidar: Lidar) -> None:
     """Refuse positions that JAX's precision rounds by more than a millimetre.
 
@@ -452,9 +457,8 @@ class ForwardModel:
         self.shapes = [u.start.shape for u in unknowns]
         self.dtypes = [u.start.dtype for u in unknowns]
         self.sizes = [u.start.size for u in unknowns]
-        # Pilot batches are the first ones: a full evaluation at the same values reuses them. Without random
-        # numbers one batch is exact.
-        self.keys = [jax.random.fold_in(key, n) for n in range(N_BATCHES if plan.is_random else 1)]
+        # Pilot batches are the first ones: a full evaluation at the same values reuses them.
+        self.keys = batch_keys(plan, key)
         self.n_pilot = min(PILOT_BATCHES, len(self.keys))
         self.retraces = any(setter.changes_response for setter in methods.setters)
         # Values of the last call, and its traced batches.

@@ -98,6 +98,17 @@ class PriorResiduals:
         whitening = self.whitening
         return whitening @ (transformed - self.centre), whitening / log_argument
 
+    def hessian(self, values: np.ndarray) -> np.ndarray:
+        """Return half of the Hessian of the sum of squared residuals, (values, values).
+
+        With a log-normal prior, q = (ln x - m) / s, it is (1 - s q) / (s x)^2 and not 1 / (s x)^2.
+        """
+        residual, jacobian = self(values)
+        curvature = (
+            np.where(self.is_log, self.weight * residual, 0.0) / np.where(self.is_log, values, 1.0) ** 2
+        )
+        return jacobian.T @ jacobian - np.diag(curvature)
+
     @property
     def basis(self) -> np.ndarray:
         """Columns: changes of the values that are independent, of unit variance, under smoothness priors."""

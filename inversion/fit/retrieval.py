@@ -4,16 +4,32 @@ import dataclasses
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
+from jax.core import Tracer
 from jaxtyping import ArrayLike, PRNGKeyArray
 
-from inversion.fit.data import ObservedWaveform, as_observed, with_fixed_window
-from inversion.fit.fit_summary import CompletedFit, Step
-from inversion.fit.model import ForwardModel
-from inversion.fit.planning import checked_plan, trace_sizes
-from inversion.fit.recorder_model import RecorderModel, check_names
+from inversion.fit.data import (
+    ObservedWaveform,
+    as_noise,
+    as_observed,
+    as_sample_times,
+    with_fixed_window,
+)
+from inversion.fit.fit_summary import CompletedFit, Step, SummarySizes
+from inversion.fit.implicit_differentiation import (
+    DifferentiableFit,
+    DifferentiatedModel,
+    EstimateDerivatives,
+    FitInputs,
+    differentiable_retrieval,
+    estimate_derivatives,
+)
+from inversion.fit.model import ForwardModel, SimulationInputs
+from inversion.fit.planning import TraceSizes, checked_plan, trace_sizes
+from inversion.fit.recorder_model import RecorderModel, check_names, recorder_unknowns
 from inversion.fit.result import Retrieval, retrieval_of
 from inversion.fit.solver import (
     DEFAULT_SOLVER,
@@ -24,10 +40,13 @@ from inversion.fit.solver import (
     multistart,
     run_fit,
 )
-from inversion.fit.unknowns import BoundUnknown, Setter, Unknown, bind_unknowns
+from inversion.fit.unknowns import BoundUnknown, Setter, Unknown, bind_unknowns, smooth_names
 from inversion.receiver.recorder import Recorder
-from jaxlidar import Lidar, Plan, Scene, Waveform
+from jaxlidar import Lidar, Plan, Scene, Waveform, trace_scene, waveform_of
 from jaxlidar.extend import check_integer, check_key, check_kind, check_kinds, check_range
+
+# Programs have no sentences; neither do they have a status.
+_STATUS_IN_PROGRAM = "fitted within a compiled program, which does not tell how the fit ended"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -89,6 +108,13 @@ def retrieve(
     cost next to nothing; if all unknowns are such, photons are traced once. Fits with equal shapes, plans and
     unknowns compile once.
 
+    **Derivatives.** `values` and `scene` of the result have first derivatives, forward and reverse, with
+    respect to `observed`, `noise`, and all numbers of lidar and scene that are not fitted: by the implicit
+    function theorem, with the Gauss-Newton Hessian (`inversion.fit.implicit_differentiation`). Unknowns at a
+    bound do not move. Noise of the simulation, `noise_floor`, priors and starts count as fixed.
+    Within `jax.jit` or `jax.vmap` the program calls the fit on the host: `status` cannot tell how it ended
+    (use `throw`), and a plan is needed if lidar, scene or times are traced.
+
     **Arguments:**
 
     - `observed`: a `Waveform`, whose `reflectance` is fitted, or an array (wavelengths, bins) of apparent
@@ -137,8 +163,8 @@ def retrieve(
     **Raises:** ValueError for inadmissible arguments, among them a start outside its bounds, samples that do
     not fit the lidar or the plan, a plan that does not serve all scenes within the bounds or that is given
     together with photons, rays or orders, derivatives that would take more than `max_memory` one at a time,
-    noise that is negative or NaN, and a lidar so far from x = y = 0 that its position is rounded by more than
-    a millimetre. TypeError for arguments of another kind.
+    noise that is negative or NaN, a lidar so far from x = y = 0 that its position is rounded by more than
+    a millimetre, and second derivatives. TypeError for arguments of another kind.
     RuntimeError if `throw` is set and the fit does not converge.
 
     **Example:**
@@ -155,24 +181,48 @@ def retrieve(
     check_key(key)
     check_progress(progress)
     sizes = trace_sizes(n_photons, n_rays, max_orders, plan)
-    # Everything that is quickly checked comes before the plan.
-    problem = checked_problem(
-        observed,
-        lidar,
-        scene,
-        unknowns,
-        noise=noise,
-        time=time,
-        solver=solver,
-        max_steps=max_steps,
-        starts=starts,
-        scale=scale,
-        recorder=recorder,
-        noise_floor=noise_floor,
-    )
-    sample_times = problem.observed.time
-    plan = checked_plan(plan, problem.lidar, scene, problem.unknowns, sample_times, sizes)
-    return solve_problem(problem, plan, key, progress=progress, throw=throw)
+
+    def checked(inputs: FitInputs) -> tuple[FitProblem, Plan]:
+        # Everything that is quickly checked comes before the plan.
+        problem = checked_problem(
+            inputs.observed,
+            inputs.lidar,
+            inputs.scene,
+            unknowns,
+            noise=inputs.noise,
+            time=inputs.time,
+            solver=solver,
+            max_steps=max_steps,
+            starts=starts,
+            scale=scale,
+            recorder=recorder,
+            noise_floor=noise_floor,
+        )
+        sample_times = problem.observed.time
+        return problem, checked_plan(
+            plan, problem.lidar, problem.scene, problem.unknowns, sample_times, sizes
+        )
+
+    inputs = FitInputs(observed, noise, time, lidar, scene, jax.random.key_data(key))
+    if not inputs.is_traced:
+        return solve_problem(*checked(inputs), key, progress=progress, throw=throw)
+
+    key_kind = str(jax.random.key_impl(key))
+
+    def as_key(inputs: FitInputs) -> PRNGKeyArray:
+        return jax.random.wrap_key_data(inputs.key_data, impl=key_kind)
+
+    def fit(inputs: FitInputs) -> tuple[DifferentiableFit, DifferentiatedModel]:
+        problem, plan = checked(inputs)
+        key = as_key(inputs)
+        return solve_with_derivatives(problem, plan, inputs, key, progress=progress, throw=throw)
+
+    def outline(inputs: FitInputs) -> tuple[DifferentiableFit, DifferentiatedModel]:
+        # What is computed of known numbers is known, although a program is being traced.
+        with jax.ensure_compile_time_eval():
+            return outline_of_fit(inputs, unknowns, plan, sizes, as_key(inputs), scale, recorder)
+
+    return differentiable_retrieval(inputs, fit, outline)
 
 
 def checked_problem(
@@ -247,7 +297,81 @@ def solve_problem(
     throw: bool = False,
 ) -> Retrieval:
     """Fit one waveform: `retrieve` with checked arguments."""
-    fit, model, recorder = fit_problem(problem, plan, key, progress=progress, throw=throw)
+    return retrieval_of_problem(problem, fit_problem(problem, plan, key, progress=progress, throw=throw))
+
+
+def solve_with_derivatives(
+    problem: FitProblem,
+    plan: Plan,
+    inputs: FitInputs,
+    key: PRNGKeyArray,
+    *,
+    progress: Callable[[Step], None] | None = None,
+    throw: bool = False,
+) -> tuple[DifferentiableFit, DifferentiatedModel]:
+    """Fit one waveform, with the derivatives of its estimates. `inputs`: those of the problem."""
+    fitted = fit_problem(problem, plan, key, progress=progress, throw=throw)
+    fit, model, recorder = fitted
+    unknowns = [*problem.unknowns, *recorder.unknowns]
+    stated_noise = as_noise(inputs.noise, problem.observed.sigma.shape)
+    derivatives = estimate_derivatives(problem.observed, stated_noise, unknowns, recorder, fit)
+    retrieval = retrieval_of_problem(problem, fitted)
+    model = DifferentiatedModel.of(plan, unknowns, len(problem.unknowns), key)
+    return DifferentiableFit.of(retrieval, fit.summary.values, derivatives), model
+
+
+def outline_of_fit(
+    inputs: FitInputs,
+    unknowns: Sequence[Unknown],
+    plan: Plan | None,
+    sizes: TraceSizes,
+    key: PRNGKeyArray,
+    scale: tuple[float, float] | None,
+    recorder: Recorder | None,
+) -> tuple[Any, DifferentiatedModel]:
+    """Return the types of the arrays of `solve_with_derivatives`, and the model, for inputs that are traced.
+
+    **Raises:** ValueError where lidar, scene or times are traced and no plan is given.
+    """
+    lidar, scene = inputs.lidar, inputs.scene
+    check_kinds(lidar, scene)
+    # Starts decide no shape, and may be traced.
+    started = [
+        u if u.where is None else dataclasses.replace(u, start=0.5 * (u.bounds[0] + u.bounds[1]))
+        for u in unknowns
+    ]
+    bound = bind_unknowns(started, scene, lidar)
+    time = inputs.observed.time if isinstance(inputs.observed, Waveform) else inputs.time
+    if plan is None:
+        if any(isinstance(x, Tracer) for x in jax.tree.leaves((lidar, scene, time))):
+            raise ValueError(
+                "plan = None, but the lidar, the scene or the times of the samples are being traced by a JAX "
+                "transformation, so that none can be made: make one outside and pass it as plan="
+            )
+        lidar = with_fixed_window(lidar)
+        plan = checked_plan(None, lidar, scene, bound, as_sample_times(time, lidar), sizes)
+    scale_unknowns = [] if scale is None else [scale_unknown(scale, bound)]
+    all_unknowns = [*bound, *recorder_unknowns(Recorder() if recorder is None else recorder), *scale_unknowns]
+    model = DifferentiatedModel.of(plan, all_unknowns, len(bound), key)
+
+    def outline() -> DifferentiableFit:
+        inputs = SimulationInputs(with_fixed_window(lidar), scene, plan, model.setters, 0)
+        setup = inputs.setup(tuple(u.start for u in bound))
+        n_unknowns, shape = sum(u.start.size for u in all_unknowns), (lidar.wavelength.size, plan.n_samples)
+        waveform = waveform_of(trace_scene(setup, model.keys[0]), setup, stderr=jnp.zeros(shape))
+        sizes = SummarySizes(n_unknowns, len(smooth_names(all_unknowns)), *shape)
+        fit = CompletedFit.of_zeros(sizes, status=_STATUS_IN_PROGRAM)
+        derivatives = EstimateDerivatives(*(jnp.zeros((n_unknowns, *shape)) for _ in range(3)))
+        retrieval = retrieval_of(fit, all_unknowns, scene, waveform)
+        return DifferentiableFit.of(retrieval, fit.summary.values, derivatives)
+
+    # Shapes suffice: nothing is computed.
+    return jax.eval_shape(outline), model
+
+
+def retrieval_of_problem(problem: FitProblem, fitted: FittedProblem) -> Retrieval:
+    """Return the result of a fit."""
+    fit, model, recorder = fitted
     # The recorder's unknowns come last, and are none of the scene's.
     scene_values = fit.summary.values[: fit.summary.values.size - recorder.count]
     waveform = model.waveform(scene_values, fit.details.evaluation, fit.details.waveform_stderr)

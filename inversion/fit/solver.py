@@ -54,7 +54,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, PRNGKeyArray
 from scipy import linalg, optimize
 
 from inversion.fit.data import (
@@ -209,6 +209,30 @@ def bounded_step(
     return step, float(np.sqrt(max(decrease, 0.0)))
 
 
+def fit_range(
+    low: Float[np.ndarray, " n"], high: Float[np.ndarray, " n"]
+) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+    """Return the range of the values of a fit within bounds."""
+    margin = _BOUND_MARGIN * (high - low)
+    return low + margin, high - margin
+
+
+def held_by_bounds(
+    values: Float[np.ndarray, " n"],
+    residual: Float[np.ndarray, " data"],
+    jacobian: Float[np.ndarray, "data n"],
+    lowest: Float[np.ndarray, " n"],
+    highest: Float[np.ndarray, " n"],
+) -> Bool[np.ndarray, " n"]:
+    """Return True for unknowns at an end of their range that the minimum within it has there as well."""
+    end = _END_OF_RANGE * (highest - lowest)
+    is_at_end = (values < lowest + end) | (values > highest - end)
+    if not np.any(is_at_end):
+        return is_at_end
+    step, _ = bounded_step(jacobian, residual, lowest - values, highest - values)
+    return is_at_end & (np.abs(step) < end)
+
+
 # -- a fit from one start
 
 
@@ -263,9 +287,7 @@ class LeastSquaresFit:
         self.settings, self.progress = settings, progress
         self.low, self.high = flat_bounds(self.unknowns)
         self.width = self.high - self.low
-        # Range of the values of the fit.
-        self.lowest = self.low + _BOUND_MARGIN * self.width
-        self.highest = self.high - _BOUND_MARGIN * self.width
+        self.lowest, self.highest = fit_range(self.low, self.high)
         self.n_scene = self.low.size - recorder_model.count
         self.start = flat_start(self.unknowns) if start is None else start
         self.prior = PriorResiduals(self.unknowns)
@@ -422,7 +444,7 @@ class LeastSquaresFit:
             accepted = bool(jnp.all(y == args[0])) and trial.is_finite
             if accepted:
                 best, best_residual, best_jacobian, n_rejected = trial, residual, jacobian, 0
-                is_held = self._is_held(best.values, residual, jacobian)
+                is_held = held_by_bounds(best.values, residual, jacobian, self.lowest, self.highest)
                 decrement = newton_decrement(jacobian[:, ~is_held], residual)
                 step_limit = min(_MAX_STEP, step_limit / _STEP_CUT)
             else:
@@ -477,15 +499,6 @@ class LeastSquaresFit:
         # determine.
         jacobian = np.concatenate([jacobian, np.diag(1.0 / self.width)])
         return bounded_step(jacobian, np.append(residual, np.zeros(values.size)), low, high)[0]
-
-    def _is_held(self, values: np.ndarray, residual: np.ndarray, jacobian: np.ndarray) -> np.ndarray:
-        """Return True for unknowns at a bound that the minimum within the bounds has there as well."""
-        end = _END_OF_RANGE * self.width
-        is_at_end = (values < self.lowest + end) | (values > self.highest - end)
-        if not np.any(is_at_end):
-            return is_at_end
-        step, _ = bounded_step(jacobian, residual, self.lowest - values, self.highest - values)
-        return is_at_end & (np.abs(step) < end)
 
     def _bounded_gauss_newton(self, best: Iterate) -> Generator[EvaluationRequest, Evaluation, Descent]:
         """Descend with steps that are solved within the bounds, from `best`.
