@@ -1,5 +1,8 @@
 """What HDF5 products declare of their numbers, by the attributes of the CF conventions: used, or refused."""
 
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 
@@ -177,3 +180,28 @@ def test_positions_of_lvis_in_other_units_are_those_of_the_product(tmp_path):
     other = jl.io.read_lvis_l1b(path)
     for name in ("anchor", "direction"):
         np.testing.assert_allclose(getattr(other[0], name), getattr(usual[0], name), rtol=1e-6, atol=1e-12)
+
+
+def test_a_file_that_another_process_writes_is_in_use(tmp_path):
+    write_photons(tmp_path / "a.h5")
+    code = "import h5py, sys; f = h5py.File(sys.argv[1], 'a'); print(flush=True); sys.stdin.read()"
+    command = [sys.executable, "-c", code, str(tmp_path / "a.h5")]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
+        assert process.stdout is not None
+        process.stdout.readline()
+        with pytest.raises(ValueError, match=r"a\.h5: it is in use: another process"):
+            jl.io.read_atl03(tmp_path / "a.h5")
+        process.stdin.close()
+    assert jl.io.read_atl03(tmp_path / "a.h5").height.size == 9
+
+
+def test_a_filter_that_is_missing_is_named(tmp_path):
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        # A registered number of a filter that HDF5 does not bring along.
+        x = file.create_dataset("x", (10,), "f8", chunks=(10,), compression=32004, allow_unknown_filter=True)
+        x.id.write_direct_chunk((0,), bytes(20))
+    with (
+        open_hdf5(tmp_path / "a.h5") as file,
+        pytest.raises(ValueError, match=r"/x: it is compressed by a filter .* pip install hdf5plugin"),
+    ):
+        file.numbers("x", "test")
