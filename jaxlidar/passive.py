@@ -74,6 +74,8 @@ _MAX_ZENITH = 85.0
 _RTOL = 1e-3
 
 Angles = Sequence[Any]
+# Photons of all batches together.
+_DEFAULT_PHOTONS = 131_072
 
 
 @final
@@ -117,7 +119,7 @@ def reflectance_factor(
     view: Angles,
     wavelengths: ArrayLike | Sequence[ArrayLike],
     key: PRNGKeyArray,
-    n_photons: int = 131_072,
+    n_photons: int | None = None,
     max_orders: int | None = None,
     area: ArrayLike | Sequence | None = None,
     plan: Plan | None = None,
@@ -136,7 +138,7 @@ def reflectance_factor(
       same, a canopy with `hotspot=True` returns its hot spot.
     - `wavelengths`: nm, one number or several that increase strictly.
     - `key`: a JAX random key.
-    - `n_photons`: photons of all eight batches together, at least 8. Default 131072.
+    - `n_photons`: photons of all eight batches together, at least 8. Default None: 131072.
     - `max_orders`: orders of scattering. Default None: as many as the albedos call for, to 0.1 %.
     - `area`: (2, 2) the corners (x, y) of the area in view, m, on the plane z = 0. Default None: the extent
       of the voxel map, or else of the terrain.
@@ -173,11 +175,14 @@ def reflectance_factor(
     centre, extent = _area_in_view(scene, area)
     lidar = _sensor(view_angles, wavelengths, centre)
     if plan is None:
-        plan = _make_plan(lidar, scene, sun_angles, n_photons, max_orders, extent)
+        count = _DEFAULT_PHOTONS if n_photons is None else n_photons
+        plan = _make_plan(lidar, scene, sun_angles, count, max_orders, extent)
     else:
         check_kind("plan", plan, Plan, "a Plan that jaxlidar.plan_reflectance made")
         if max_orders is not None:
             raise ValueError("plan is given together with max_orders; admissible is either")
+        if n_photons is not None:
+            raise ValueError("plan is given together with n_photons; admissible is either")
         sun_zenith = concrete(sun_angles[0])
         if plan.config.vertical and (sun_zenith is None or float(sun_zenith) != 0):
             raise ValueError("plan is for a sun in the zenith; make one for this sun")
@@ -218,7 +223,7 @@ def plan_reflectance(
     sun: Angles,
     view: Angles,
     wavelengths: ArrayLike | Sequence[ArrayLike],
-    n_photons: int = 131_072,
+    n_photons: int = _DEFAULT_PHOTONS,
     max_orders: int | None = None,
     area: ArrayLike | Sequence | None = None,
 ) -> Plan:

@@ -184,3 +184,12 @@ def test_inadmissible_arguments_are_refused():
     mirror = eqx.tree_at(lambda s: s.ground, scene, jl.Ground(law=jl.Specular(roughness=0.0)))
     with pytest.raises(ValueError, match="mirror"):
         jl.reflectance_factor(mirror, **options)
+
+
+@pytest.mark.parametrize("field", ["n_photons", "max_orders"])
+def test_a_plan_together_with_what_it_holds_is_refused(field):
+    options = {"sun": (30.0, 0.0), "view": (0.0, 0.0), "wavelengths": 865.0, "area": [(0, 0), (1, 1)]}
+    scene = jl.Scene(ground=jl.Ground(reflectance=0.3))
+    plan = jl.plan_reflectance(scene, n_photons=64, **options)
+    with pytest.raises(ValueError, match=f"plan is given together with {field}; admissible is either"):
+        jl.reflectance_factor(scene, plan=plan, key=KEY, **options, **{field: 64})

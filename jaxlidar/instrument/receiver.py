@@ -13,7 +13,7 @@ energy e = h c / wavelength, a sample is
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, ClassVar, Literal, TypeAlias, final, overload
 
 import equinox as eqx
@@ -60,6 +60,8 @@ from jaxlidar.instrument.photon_counter import (
 _POISSON_MAX = 1e4
 
 Wavelengths: TypeAlias = ArrayLike | Sequence[ArrayLike]
+# A function of a key, expected energies and wavelengths, which gives noisy samples.
+NoiseModel: TypeAlias = Callable[[Array, Array, Array], Any]
 
 
 @final
@@ -136,6 +138,7 @@ def record(
     key: Array | None = None,
     mode: Literal["waveform"] = "waveform",
     pulses: int = 1,
+    noise_model: NoiseModel | None = None,
 ) -> Float[Array, "*channels wavelengths bins"]: ...
 
 
@@ -159,6 +162,7 @@ def record(
     key: Array | None = None,
     mode: str = "waveform",
     pulses: int = 1,
+    noise_model: NoiseModel | None = None,
 ) -> Float[Array, "*channels wavelengths bins"] | PhotonEvents:
     """Record a waveform with a receiver: as samples, or as photon events.
 
@@ -181,6 +185,11 @@ def record(
     - `mode`: "waveform" for samples or "photons" for events. Default "waveform".
     - `pulses`: number of pulses, each with the waveform's energy, whose events are drawn; an integer of at
       least 1. Default 1, the only admissible one for samples.
+    - `noise_model`: a function of `key`, the expected energies with the background, (..., wavelengths, bins)
+      J, and the wavelengths in nm, (..., wavelengths, 1), which broadcast with them, that returns the noisy
+      samples, of the shape of the energies, in place of the receiver's photon and electronic noise.
+      Saturation, threshold and quantisation follow. Where JAX traces the energies it is to be traceable,
+      otherwise NumPy will do. Default None: those of the receiver.
 
     **Returns:** J per sample, an array shaped as the energies; or `PhotonEvents`. Derivatives of samples pass
     through the quantisation as if it were absent (a straight-through estimate). They pass through the noise
@@ -189,10 +198,11 @@ def record(
 
     **Raises:** ValueError where the energies have fewer than two axes, for infinite energies, for negative
     ones in an array, and where those of a waveform take more than 1 % from it; for wavelengths that are not
-    positive, and for neither one nor one per row of the energies; for events, also for energies of NaN, and
-    where there would be more than 10^8; TypeError for an object of the wrong type. Inside a JAX
-    transformation, where values cannot be refused, such samples become NaN: the negative or infinite ones
-    of an array, all of a waveform.
+    positive, and for neither one nor one per row of the energies; for a noise model without a key, with
+    `mode` "photons", or that returns another shape than that of the energies; for events, also for energies
+    of NaN, and where there would be more than 10^8; TypeError for an object of the wrong type. Inside a JAX
+    transformation, where values cannot be refused, such samples become NaN: the negative or infinite ones of
+    an array, all of a waveform.
 
     **Example:** samples, and the events of ten pulses over the same ground.
 
@@ -210,6 +220,9 @@ def record(
     69 photon events of 1 shot with 10 pulses each: 1 of background; 8 lost to dead time
     """
     check_choice("mode", mode, ("waveform", "photons"))
+    check_kind("noise_model", noise_model, Callable | None, "a function, or None")
+    if noise_model is not None and (key is None or mode == "photons"):
+        raise ValueError("noise_model is given; admissible is one with a key, where mode = 'waveform'")
     is_waveform = hasattr(wave, "energy")
     if is_waveform and wavelength is not None:
         raise ValueError("wavelength is given, but wave is a waveform, which has its own")
@@ -236,7 +249,18 @@ def record(
             f"{energy.shape[-2]} wavelengths of energy"
         )
     energy = _admissible_waveform(energy) if is_waveform else _admissible_samples(energy)
-    return digitise(energy, wavelength, receiver, key)
+    if noise_model is None:
+        return digitise(energy, wavelength, receiver, key)
+    assert key is not None
+    check_key(key)
+    wavelengths = jnp.broadcast_to(wavelength, energy.shape[-2:-1])
+    wavelengths = wavelengths.reshape((1,) * (energy.ndim - 2) + (-1, 1))
+    samples = as_array(
+        noise_model(key, energy + receiver.background, wavelengths), "what noise_model returns"
+    )
+    if samples.shape != energy.shape:
+        raise ValueError(f"noise_model returns the shape {samples.shape}; admissible is {energy.shape}")
+    return _quantise(samples, receiver)
 
 
 def _admissible_samples(energy: Array) -> Array:
@@ -293,6 +317,12 @@ def _digitise(energy: Array, wavelength: Array, receiver: Receiver, key: Array |
             value = _shot_noise(expected, wavelength, photon_key)
         noise = jax.random.normal(electronic_key, energy.shape, energy.dtype)
         value = value + receiver.electronic_noise * noise
+    return _quantise(value, receiver)
+
+
+@eqx.filter_jit
+def _quantise(value: Array, receiver: Receiver) -> Array:
+    """Apply saturation, detection threshold and quantisation to samples with their noise."""
     if receiver.saturation is not None:
         value = jnp.minimum(value, receiver.saturation)
     threshold = receiver.detection_threshold

@@ -20,6 +20,15 @@ MAX_EXACT_INTEGER = 2**53
 TWO_WAY_METRES_PER_NS, TWO_WAY_TOLERANCE = SPEED_OF_LIGHT / 2, 0.01
 # What HDF5, h5netcdf, zarr and xarray raise for damaged files.
 _DAMAGED = (OSError, RuntimeError, ValueError, KeyError, TypeError, AttributeError, OverflowError)
+_FILTER = (
+    "it is compressed by a filter that HDF5 lacks here: pip install hdf5plugin, and import hdf5plugin first"
+)
+# Why HDF5 cannot read a file that is not damaged, by words of its messages.
+_OTHER_REASONS = {
+    "unable to lock file": "it is in use: another process has it open and may write to it",
+    "required filter": _FILTER,
+    "can't open directory": _FILTER,
+}
 
 
 class FileWarning(UserWarning, ValueError):
@@ -57,6 +66,10 @@ def refuse_damage(refusal: str) -> Iterator[None]:
     try:
         yield
     except _DAMAGED as error:
+        # What HDF5 cannot read for another reason than damage.
+        reason = next((text for words, text in _OTHER_REASONS.items() if words in str(error)), None)
+        if reason is not None:
+            refusal = f"{refusal.rpartition(': ')[0]}: {reason}"
         raise ValueError(f"{refusal} ({error})") from error
 
 

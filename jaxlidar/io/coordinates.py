@@ -60,6 +60,17 @@ _ANGLE_NAMES = {
     1.0: ("radian", "rad"),
 }
 _RADIANS_BY_NAME = {name: radians for radians, names in _ANGLE_NAMES.items() for name in names}
+# Those of times, by their size in s.
+_TIME_NAMES = {
+    1.0: ("second", "sec", "s"),
+    1e-3: ("millisecond", "msec", "ms"),
+    1e-6: ("microsecond", "usec", "us"),
+    1e-9: ("nanosecond", "nsec", "ns"),
+    60.0: ("minute", "min"),
+    3600.0: ("hour", "hr", "h"),
+    86400.0: ("day", "d"),
+}
+_SECONDS_BY_NAME = {name: seconds for seconds, names in _TIME_NAMES.items() for name in names}
 # Lengths in m that waveforms without a declared unit may have: metre and foot.
 _UNDECLARED_LENGTHS = (1.0, 0.3048)
 # Units of length in m in which heights are given; those of x and y, such as km, may be larger.
@@ -268,6 +279,15 @@ def unit_angle(location: str, unit: str | None) -> float | None:
     **Raises:** ValueError, naming the location in the file, for an unknown unit.
     """
     return _size_by_name(location, unit, _RADIANS_BY_NAME)
+
+
+def unit_time(location: str, unit: str | None) -> float | None:
+    """Return the seconds of a unit of time that a file names, such as "ms"; None without one.
+
+    **Raises:** ValueError, naming the location in the file, for an unknown unit.
+    """
+    # "Seconds of the day" are seconds.
+    return _size_by_name(location, None if unit is None else unit.partition(" of ")[0], _SECONDS_BY_NAME)
 
 
 def _size_by_name(location: str, unit: str | None, sizes: dict[str, float]) -> float | None:

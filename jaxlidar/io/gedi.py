@@ -42,7 +42,7 @@ from jaxlidar.io.checks import (
     refuse_damage,
     warn_of_file,
 )
-from jaxlidar.io.coordinates import check_elevations, unit_angle, unit_length
+from jaxlidar.io.coordinates import check_elevations
 from jaxlidar.io.hdf5 import ProductFile, open_hdf5
 from jaxlidar.io.noise import above_pedestal
 
@@ -62,16 +62,17 @@ _PER_SHOT = (
     "geolocation/local_beam_elevation",
     "geolocation/local_beam_azimuth",
 )
-# For datasets that may name a unit, the function that reads its name, and the size of the expected one.
+# Units that datasets have, unless they name another one.
 _UNITS = {
-    **{
-        f"geolocation/{name}_{end}": (unit_length, 1.0)
-        for name in ("elevation",)
-        for end in ("bin0", "lastbin")
-    },
-    "geolocation/altitude_instrument": (unit_length, 1.0),
-    **{f"geolocation/{name}_lastbin": (unit_angle, np.pi / 180) for name in ("latitude", "longitude")},
-    **{f"geolocation/local_beam_{name}": (unit_angle, 1.0) for name in ("elevation", "azimuth")},
+    "geolocation/elevation_bin0": "m",
+    "geolocation/elevation_lastbin": "m",
+    "geolocation/altitude_instrument": "m",
+    "geolocation/latitude_lastbin": "degrees",
+    "geolocation/longitude_lastbin": "degrees",
+    "geolocation/local_beam_elevation": "rad",
+    "geolocation/local_beam_azimuth": "rad",
+    "geolocation/solar_elevation": "degrees",
+    "delta_time": "s since 2018-01-01",
 }
 # Datasets of other numbers of a GediShot, and of its flags; subsets may have left them out.
 _OPTIONAL = {"solar_elevation": "geolocation/solar_elevation", "delta_time": "delta_time"}
@@ -524,9 +525,7 @@ class _Beam:
     def _in_units(self, field: str) -> np.ndarray:
         """Return the numbers of all shots in the unit of `_UNITS`, by the dataset's attribute `units`."""
         values = self._read_numbers(field)
-        if field not in _UNITS:
-            return values
-        return self.file.in_unit(f"{self.name}/{field}", values, *_UNITS[field])
+        return self.file.in_unit(f"{self.name}/{field}", values, _UNITS.get(field, ""))
 
     @functools.cached_property
     def _flags(self) -> dict[str, np.ndarray]:
@@ -560,7 +559,7 @@ class _Beam:
                 continue
             try:
                 self._check_shape(field)
-                columns[name] = self._read_numbers(field)
+                columns[name] = self._in_units(field)
             except ValueError as error:
                 self.remarks.append(f"{error}: it is left out")
         return columns

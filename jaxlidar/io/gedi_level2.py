@@ -12,7 +12,6 @@ import numpy as np
 
 from jaxlidar._checks import check_numbers
 from jaxlidar.io.checks import warn_of_file
-from jaxlidar.io.coordinates import unit_length
 from jaxlidar.io.hdf5 import ProductFile, open_hdf5
 from jaxlidar.io.tables import Column, ColumnAxis, ShotTable
 
@@ -92,8 +91,6 @@ _LEVEL_2B = (
     _Field("pai_z", ("pai_z",), "m2 m-2", "plant area above the bottom of the layer", "layer_bottom"),
     _Field("pavd_z", ("pavd_z",), "m2 m-3", "plant area density of the layer", "layer_bottom"),
 )
-# Lengths that versions of the product have stored in cm.
-_LENGTHS = {"rh", "rh100", *(f"rh_a{n}" for n in _GROUPS)}
 
 
 def read_gedi_l2a(
@@ -228,8 +225,8 @@ def _read_beam(
         if len(values) != numbers.size:
             raise ValueError(f"{file.location(name)}: {len(values)} rows, shot_number has {numbers.size}")
         values = np.where(values == _FILL, np.nan, values)
-        if field.name in _LENGTHS:
-            values = file.in_unit(name, values, unit_length, 1.0)
+        unit = "s since 2018-01-01" if field.name == "delta_time" else field.unit
+        values = file.in_unit(name, values, unit)
         columns[field.name] = Column(values, field.unit, field.description, _axis(file, beam, field, values))
     return columns
 
@@ -247,7 +244,7 @@ def _axis(file: ProductFile, beam: str, field: _Field, values: np.ndarray) -> Co
     thickness, name = _LAYER_THICKNESS, f"{beam}/ancillary/dz"
     if file.has(name):
         # One number is in use, however many the file has.
-        stated = file.numbers(name, "GEDI L2B", rows=slice(1))
+        stated = file.in_unit(name, file.numbers(name, "GEDI L2B", rows=slice(1)), "m")
         # Written so that NaN is refused.
         if stated.size == 0 or not 0 < stated[0] <= _MAX_LAYER_THICKNESS:
             raise ValueError(

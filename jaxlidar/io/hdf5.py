@@ -1,4 +1,8 @@
-"""Datasets of numbers in HDF5 products, checked against the file before they are read; fill values are NaN.
+"""Datasets of numbers in HDF5 products, checked against the file before they are read.
+
+Attributes are those of the CF conventions: numbers that equal `_FillValue` or `missing_value`, lie outside of
+`valid_min`, `valid_max` or `valid_range`, or are none of `flag_values`, are missing; `units` are converted.
+Packed numbers (`scale_factor`, `add_offset`) are refused.
 
 HDF5 answers for what a file does not hold with zeros, and for what it declares with memory. So a dataset is
 read only if it has numbers, its chunks are all stored, and its size is plausible for the size of the file.
@@ -10,12 +14,13 @@ that refuses heaps like that. Of products only they are: a stream of Python is s
 """
 
 import contextlib
+import datetime
 import functools
 import io
 import math
 import os
 import re
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -23,12 +28,21 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxlidar.io.checks import check_unpacked_size, existing_file, refuse_damage
-from jaxlidar.io.coordinates import units_agree
+from jaxlidar.io.coordinates import unit_angle, unit_length, unit_time, units_agree
 
 # Attributes of numbers that are stored as counts.
 _STORED_AS_COUNTS = {"scale_factor": 1.0, "add_offset": 0.0}
-# The attribute of a dataset with the value that stands for a missing one.
-_FILL_ATTRIBUTE = "_FillValue"
+# Attributes with values that stand for a missing number.
+_FILL_ATTRIBUTES = ("_FillValue", "missing_value")
+# Units of numbers that readers ask for: the function that reads a unit of the kind, and the size.
+_UNITS = {
+    "m": (unit_length, 1.0),
+    "degrees": (unit_angle, math.pi / 180.0),
+    "rad": (unit_angle, 1.0),
+    "s": (unit_time, 1.0),
+}
+# Between the unit and the epoch of a time.
+_SINCE = " since "
 # First bytes of a global heap, which its size follows: the signature, version 1, three bytes that are kept.
 _HEAP = b"GCOL\x01\0\0\0"
 # First bytes of an object of a heap, which its size follows; number 0 is what is free. Both are kept to
@@ -153,33 +167,88 @@ class ProductFile:
     def numbers(
         self, name: str, product: str, ndim: int = 1, rows: Any = slice(None)
     ) -> Float[np.ndarray, "..."]:
-        """Return numbers in double precision; NaN where they are the dataset's fill value."""
-        values = self.read(name, product, ndim, rows)
-        fill = self.attribute(name, _FILL_ATTRIBUTE)
-        is_fill = np.zeros(values.shape, bool) if fill is None else np.isin(values, fill)
-        with np.errstate(over="ignore", invalid="ignore"):
-            return np.where(is_fill, np.nan, values.astype(np.float64))
+        """Return numbers in double precision; NaN where they are missing by the dataset's attributes.
 
-    def in_unit(
-        self,
-        name: str,
-        values: Float[np.ndarray, "..."],
-        read_unit: Callable[[str, str | None], float | None],
-        size: float,
-    ) -> Float[np.ndarray, "..."]:
+        **Raises:** as `dataset`; ValueError for attributes that are no numbers.
+        """
+        values = self.read(name, product, ndim, rows)
+        with np.errstate(over="ignore", invalid="ignore"):
+            return np.where(self._is_missing(name, values), np.nan, values.astype(np.float64))
+
+    def _is_missing(self, name: str, values: np.ndarray) -> np.ndarray:
+        """Return True where attributes declare numbers missing."""
+        is_missing = np.zeros(values.shape, bool)
+
+        def as_compared(stated: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+            # Attributes may have another type: of two types the less precise one, to which one was rounded.
+            low = min((values.dtype, stated.dtype), key=lambda dtype: dtype.itemsize)
+            is_float = values.dtype.kind == stated.dtype.kind == "f"
+            return (values.astype(low), stated.astype(low)) if is_float else (values, stated)
+
+        for key in _FILL_ATTRIBUTES:
+            if (fill := self._stated_numbers(name, key)) is not None:
+                is_missing |= np.isin(*as_compared(fill))
+        limits = {key: self._stated_numbers(name, key) for key in ("valid_min", "valid_max", "valid_range")}
+        if (both := limits.pop("valid_range")) is not None:
+            if both.size != 2:
+                raise ValueError(f"{self.location(name)}: valid_range = {both}; admissible are two numbers")
+            limits["valid_min"], limits["valid_max"] = both[:1], both[1:]
+        for key, limit in limits.items():
+            if limit is not None:
+                compared, bound = as_compared(limit[:1])
+                is_missing |= compared < bound if key == "valid_min" else compared > bound
+        flags = self._stated_numbers(name, "flag_values")
+        # With masks, the values are those of some of the bits.
+        if flags is not None and self.attribute(name, "flag_masks") is None:
+            is_missing |= ~np.isin(*as_compared(flags))
+        return is_missing
+
+    def _stated_numbers(self, name: str, key: str) -> np.ndarray | None:
+        """Return the numbers of an attribute, which may be text; None where it states none, as "N/A".
+
+        **Raises:** ValueError for text with digits that is no list of numbers.
+        """
+        stated = self.attribute(name, key)
+        if stated is None:
+            return None
+        numbers = np.atleast_1d(np.asarray(stated)).ravel()
+        if numbers.dtype.kind in "iuf":
+            return numbers if numbers.size else None
+        words = " ".join(map(text_of_attribute, numbers.tolist())).strip(" []()").replace(",", " ").split()
+        try:
+            return np.array(list(map(float, words))) if words else None
+        except ValueError:
+            if not any(character.isdigit() for character in "".join(words)):
+                return None
+            raise ValueError(
+                f"{self.location(name)}: {key} = {' '.join(words)!r}; admissible are numbers"
+            ) from None
+
+    def in_unit(self, name: str, values: Float[np.ndarray, "..."], unit: str) -> Float[np.ndarray, "..."]:
         """Return values of a dataset in another unit than that which its attribute `units` states, if any.
 
-        **Arguments:** `read_unit`: `unit_length` or `unit_angle`. `size`: of the unit that is returned, in m
-        or rad.
+        **Arguments:** `unit`: that is returned: "m", "degrees", "rad", "s" or, of times, such as "s since
+        2018-01-01"; values of other units are returned as they are.
+
+        **Raises:** ValueError, naming the dataset, for a unit or an epoch that is not known.
         """
+        unit, _, epoch = unit.partition(_SINCE)
+        if unit not in _UNITS:
+            return values
+        read_unit, size = _UNITS[unit]
         stated = self.attribute(name, "units")
         if stated is None:
             stated = self.attribute(name, "unit")
         if stated is None:
             return values
-        text = text_of_attribute(stated)
-        unit = read_unit(self.location(name), text)
-        return values if unit is None or units_agree(unit, size) else values * (unit / size)
+        location = self.location(name)
+        name_of_unit, _, stated_epoch = text_of_attribute(stated).partition(_SINCE)
+        stated_size = read_unit(location, name_of_unit)
+        if stated_size is not None and not units_agree(stated_size, size):
+            values = values * (stated_size / size)
+        if epoch and stated_epoch:
+            values = values + _seconds_between(location, epoch, stated_epoch) / size
+        return values
 
 
 class CheckedHeapStream(io.FileIO):
@@ -229,6 +298,18 @@ class CheckedHeapStream(io.FileIO):
 def _aligned(size: int) -> int:
     """Return the size of what is kept to a multiple of the alignment of heaps."""
     return -(-size // _HEAP_ALIGNMENT) * _HEAP_ALIGNMENT
+
+
+def _seconds_between(location: str, epoch: str, stated_epoch: str) -> float:
+    """Return the seconds from an epoch to that which a file states. **Raises:** ValueError for no time."""
+    text = stated_epoch.strip().removesuffix("UTC").removesuffix("Z").strip()
+    try:
+        stated = datetime.datetime.fromisoformat(text)
+        return (stated.replace(tzinfo=None) - datetime.datetime.fromisoformat(epoch)).total_seconds()
+    except ValueError:
+        raise ValueError(
+            f"{location}: times since {stated_epoch!r}; admissible is a date such as {epoch}"
+        ) from None
 
 
 def text_of_attribute(attribute: Any) -> str:

@@ -47,6 +47,8 @@ _IMPULSE_RANGE = (-10.0, 30.0)
 _NO_INTEGER = -9999
 # Columns of photons with their place, and their datasets.
 _PLACES = {"latitude": "lat_ph", "longitude": "lon_ph"}
+# Unit of times since the epoch of the product.
+_TIMES = "s since 2018-01-01"
 # Sub-segments of a segment of ATL08.
 _SUBSEGMENTS = 5
 
@@ -197,16 +199,16 @@ def read_atl03(
     with open_hdf5(path) as file:
         beam = _beam(file, beam, "heights", _PHOTONS)
 
-        def segments_of(name: str, needed: bool = True) -> np.ndarray:
+        def segments_of(name: str, unit: str = "", needed: bool = True) -> np.ndarray:
             """Return a column of the segments; NaN where a subset has left it out."""
             field = f"{beam}/geolocation/{name}"
             if not needed and not file.has(field):
                 return np.full(count.shape, np.nan)
-            return _without_fills(_rows_of(file, field, count.size, "segment_ph_cnt"))
+            return _rows_of(file, field, count.size, "segment_ph_cnt", unit=unit)
 
         count = _without_fills(file.numbers(f"{beam}/geolocation/segment_ph_cnt", _PHOTONS))
-        start = segments_of("segment_dist_x")
-        latitudes = segments_of("reference_photon_lat", needed=False)
+        start = segments_of("segment_dist_x", "m")
+        latitudes = segments_of("reference_photon_lat", "degrees", needed=False)
         is_chosen = np.abs(start) <= MAX_COORDINATE
         if stretch is not None:
             origin = start[is_chosen].min() if np.any(is_chosen) else 0.0
@@ -226,13 +228,14 @@ def read_atl03(
         rows = slice(int(first_photon[run[0]]), int(first_photon[run[-1]] + count[run[-1]]))
         segment = np.repeat(run, count[run].astype(int))
 
-        def photons_of(name: str, columns: int | None = None) -> np.ndarray:
-            return _rows_of(file, f"{beam}/heights/{name}", photons, "h_ph", rows=rows, columns=columns)
+        def photons_of(name: str, unit: str = "", columns: int | None = None) -> np.ndarray:
+            field = f"{beam}/heights/{name}"
+            return _rows_of(file, field, photons, "h_ph", unit=unit, rows=rows, columns=columns)
 
-        height, along = _without_fills(photons_of("h_ph")), _without_fills(photons_of("dist_ph_along"))
+        height, along = photons_of("h_ph", "m"), photons_of("dist_ph_along", "m")
         # Written so that NaN is left out.
         has_place = (np.abs(height) <= _MAX_HEIGHT) & (np.abs(along) <= _MAX_HEIGHT)
-        time = photons_of("delta_time")
+        time = photons_of("delta_time", _TIMES)
         has_place &= np.abs(time) <= _MAX_TIME
         is_complete = np.isin(segment, chosen) & has_place
         incomplete = int(np.sum(~has_place))
@@ -241,7 +244,7 @@ def read_atl03(
                 f"{file.location(f'{beam}/heights')}: {incomplete} of {height.size} photons have no height, "
                 "no distance or no time: they are left out"
             )
-        confidence = photons_of("signal_conf_ph", len(SURFACES))[:, SURFACES.index(surface)]
+        confidence = photons_of("signal_conf_ph", columns=len(SURFACES))[:, SURFACES.index(surface)]
         quality = (
             photons_of("quality_ph") if file.has(f"{beam}/heights/quality_ph") else np.zeros(height.size)
         )
@@ -251,15 +254,15 @@ def read_atl03(
         if np.any(pulse[is_complete] == _NO_INTEGER):
             pulse = _pulses_by_time(np.where(is_complete, time, np.nan))
         background = _background_rate(file, beam, time)
-        width = segments_of("tx_pulse_width_lower", needed=False)
-        places = {name: photons_of(field)[is_complete] for name, field in _PLACES.items()}
+        width = segments_of("tx_pulse_width_lower", "s", needed=False)
+        places = {name: photons_of(field, "degrees")[is_complete] for name, field in _PLACES.items()}
         columns = {
             "segment_id": _whole_numbers(segments_of("segment_id")[chosen]),
             "segment_start": start[chosen] - start[chosen[0]],
-            "segment_length": segments_of("segment_length")[chosen],
+            "segment_length": segments_of("segment_length", "m")[chosen],
             "segment_latitude": latitudes[chosen],
-            "segment_longitude": segments_of("reference_photon_lon", needed=False)[chosen],
-            "solar_elevation": segments_of("solar_elevation", needed=False)[chosen],
+            "segment_longitude": segments_of("reference_photon_lon", "degrees", needed=False)[chosen],
+            "solar_elevation": segments_of("solar_elevation", "degrees", needed=False)[chosen],
         }
         impulse = _impulse(file, beam)
     mean_width = 1e9 * float(np.nanmean(width)) if np.any(np.isfinite(width)) else None
@@ -302,12 +305,13 @@ def _rows_of(
     length: int,
     of: str,
     *,
+    unit: str = "",
     rows: slice = slice(None),
     columns: int | None = None,
 ) -> np.ndarray:
     """Return numbers, or those of some rows, of a dataset of `length` rows, as many as that named `of` has.
 
-    **Arguments:** `columns`: that it has. None: it has one dimension.
+    **Arguments:** `unit`: that of `ProductFile.in_unit`. `columns`: that it has. None: it has one dimension.
 
     **Raises:** ValueError for another shape, and as `ProductFile.numbers`.
     """
@@ -317,7 +321,7 @@ def _rows_of(
         raise ValueError(
             f"{file.location(name)}: shape {shape}; admissible is {admissible}: {of} has {length} rows"
         )
-    return file.numbers(name, _PHOTONS, ndim, rows)
+    return file.in_unit(name, _without_fills(file.numbers(name, _PHOTONS, ndim, rows)), unit)
 
 
 def _without_fills(values: np.ndarray) -> np.ndarray:
@@ -382,8 +386,8 @@ def _background_rate(file: ProductFile, beam: str, time: np.ndarray) -> np.ndarr
     names = [f"{beam}/bckgrd_atlas/{name}" for name in ("delta_time", "bckgrd_rate")]
     if not all(map(file.has, names)):
         return np.full(time.shape, np.nan)
-    when = _without_fills(file.numbers(names[0], _PHOTONS))
-    rate = _without_fills(_rows_of(file, names[1], when.size, "delta_time"))
+    when = file.in_unit(names[0], _without_fills(file.numbers(names[0], _PHOTONS)), _TIMES)
+    rate = _rows_of(file, names[1], when.size, "delta_time")
     is_known = np.isfinite(when) & np.isfinite(rate)
     if not np.any(is_known):
         return np.full(time.shape, np.nan)
@@ -410,7 +414,8 @@ def _impulse(file: ProductFile, beam: str) -> PhotonImpulse | None:
         return None
     # Without numbers that are missing, or so large that sums of them overflow.
     time, count = (
-        _without_fills(file.numbers(f"{group}/{name}", _PHOTONS)) for name in ("tep_hist_time", "tep_hist")
+        file.in_unit(f"{group}/{name}", _without_fills(file.numbers(f"{group}/{name}", _PHOTONS)), unit)
+        for name, unit in (("tep_hist_time", "s"), ("tep_hist", ""))
     )
     # Damaged bytes may be NaN that signal, of which products warn.
     with np.errstate(invalid="ignore"):
@@ -510,7 +515,7 @@ def read_atl08(path: str | os.PathLike[str], beam: str | None = None, *, segment
                 and fine_name is not None
                 and (field.name in ("ground", "canopy") or file.has(fine_name))
             ):
-                values = file.numbers(fine_name, _HEIGHTS, 2)
+                name, values = fine_name, file.numbers(fine_name, _HEIGHTS, 2)
                 if values.shape != (first_id.size, _SUBSEGMENTS):
                     raise ValueError(
                         f"{file.location(fine_name)}: shape {values.shape}; admissible is "
@@ -530,7 +535,9 @@ def read_atl08(path: str | os.PathLike[str], beam: str | None = None, *, segment
                 )
             else:
                 continue
-            columns[field.name] = Column(_without_fills(values), field.unit, field.description)
+            unit = _TIMES if field.name == "delta_time" else field.unit
+            values = file.in_unit(name, _without_fills(values), unit)
+            columns[field.name] = Column(values, field.unit, field.description)
     if is_fine:
         first_id = (first_id[:, None] + np.arange(_SUBSEGMENTS)).ravel()
     number = Column(_whole_numbers(first_id), "", "number of the geolocation segment")

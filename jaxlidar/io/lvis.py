@@ -33,6 +33,8 @@ from jaxlidar.io.text import parse_number, read_lines, split_cells
 
 _PRODUCT = "LVIS L1B"
 _UNITS = CoordinateUnits(True, np.pi / 180.0, 1.0)
+# Columns of shots that files may have, and their units.
+_COLUMNS = {"TIME": "s", "SHOTNUMBER": "", "SIGMEAN": "", "INCIDENTANGLE": "degrees"}
 # Shots whose samples are read at once.
 _BLOCK = 256
 # Sampling intervals in ns of the digitisers in use.
@@ -114,8 +116,8 @@ class _LvisShots(AirborneShots):
             shots = len(first_position)
             shapes = {name: file.dataset(name, _PRODUCT, 2).shape for name in ("RXWAVE", "TXWAVE")}
             columns = {
-                name: file.numbers(name, _PRODUCT) if file.has(name) else None
-                for name in ("TIME", "SHOTNUMBER", "SIGMEAN", "INCIDENTANGLE")
+                name: file.in_unit(name, file.numbers(name, _PRODUCT), unit) if file.has(name) else None
+                for name, unit in _COLUMNS.items()
             }
         for name, shape in shapes.items():
             if shape[0] != shots or shape[1] < QUIET_SAMPLES:
@@ -259,7 +261,10 @@ def _number_of_last_sample(file: ProductFile) -> str:
 
 def _positions(file: ProductFile, number: str) -> Float[np.ndarray, "shots 3"]:
     """Return longitude, latitude and elevation of a sample, such as "1023"."""
-    columns = [file.numbers(f"{axis}{number}", _PRODUCT) for axis in ("LON", "LAT", "Z")]
+    columns = [
+        file.in_unit(f"{axis}{number}", file.numbers(f"{axis}{number}", _PRODUCT), unit)
+        for axis, unit in (("LON", "degrees"), ("LAT", "degrees"), ("Z", "m"))
+    ]
     if len({column.shape for column in columns}) > 1:
         shapes = [column.shape for column in columns]
         raise ValueError(f"{file.path}: /LON{number}, /LAT{number}, /Z{number}: shapes {shapes}")

@@ -23,7 +23,9 @@ _DENSITY_COLUMNS = ("PadBVTotal", "attenuation_FPL_unbiasedMLE")
 # Columns that a file may have: number of beams that sampled a voxel, their mean angle from the vertical in
 # degrees, and the voxel's height above the ground in m.
 _SAMPLING, _ANGLE, _GROUND_DISTANCE = "nbSampling", "angleMean", "ground_distance"
-_HEADER_KEYS = ("min_corner", "max_corner", "split", "res", "lad_type")
+_HEADER_KEYS = ("min_corner", "max_corner", "split", "res", "lad_type", "type")
+# Materials that densities of a type of the header (leaf, wood area density; PAD is of both) can stand for.
+_MATERIAL_OF_TYPE = {"lad": "leaf", "wad": "bark"}
 # Numbers of the header stand in brackets, with commas between them, or, in older files, without either.
 _BRACKETS, _SEPARATORS = "()[]{}", re.compile(r"[\s,;]+")
 # Edges of voxels that differ by less, in m, agree: headers are rounded. (AMAPVox has the same limit.)
@@ -75,9 +77,9 @@ def read_vox(
     **Returns:** a `VoxelsRead`: the `VoxelMap`, and the voxels that were dropped, by reason. The density
     `fill` is that of voxels that no beam sampled ("not sampled"), which sparse maps leave out, and of those
     whose density is not a number ("without a density"). Voxels below the ground ("below the ground") that
-    hold a density lose it. Leaf angles are those that the file names (`lad_type`), spherical where it names
-    none. Voxels have the edges `res` from `min_corner` on, or, without `res`, are those of the grid from
-    `min_corner` to `max_corner`.
+    hold a density, or would be filled, have none. Leaf angles are those that the file names (`lad_type`),
+    spherical where it names none. Voxels have the edges `res` from `min_corner` on, or, without `res`, are
+    those of the grid from `min_corner` to `max_corner`.
 
     **Warns:** `FileWarning` where the grid of `res` does not end at `max_corner`.
 
@@ -85,7 +87,8 @@ def read_vox(
     first line or a header that is missing or makes no sense, another unit than the metre in it, leaf angles
     without a name here, columns that are missing or given twice, rows of the wrong length, no row or
     implausibly few, indices outside the grid or given twice, negative densities, and angles outside 0 to 180
-    degrees. ValueError for a `fill` that is negative or not finite, and for another `name`.
+    degrees; for `name` "leaf" where the header's type is WAD, wood area density, and "bark" where it is LAD.
+    ValueError for a `fill` that is negative or not finite, and for another `name`.
 
     **Source:** Vincent et al. (2017), Remote Sens. Environ. 190, 273; Vincent, Pimont and Verley (2021), A
     note on PAD/LAD estimators implemented in AMAPVox 1.7, doi:10.23708/1AJNMP.
@@ -107,6 +110,11 @@ def read_vox(
     path, lines = read_lines(path)
     header, column_line = _read_header(path, lines)
     _check_units(path, header)
+    kind, line = header.get("type", ("", 0))
+    if (material := _MATERIAL_OF_TYPE.get(kind.lower(), name)) != name:
+        raise ValueError(
+            f"{path}: line {line}: type = {kind}, with name = {name!r}; give name = {material!r}"
+        )
     grid = _read_grid(path, header)
     angles = _leaf_angles(path, header)
     names = lines[column_line].split()
@@ -145,18 +153,20 @@ def read_vox(
             raise ValueError(f"{path}: line {row.line}: voxel {row.voxel} is given a second time")
         is_read[row.voxel] = True
         value = row.values[density] if convert is None else convert(row, density)
-        if np.isnan(value):
-            dropped["without a density"] += 1
-        elif not 0 <= value <= _MAX_DENSITY:
+        if not (np.isnan(value) or 0 <= value <= _MAX_DENSITY):
             raise ValueError(
                 f"{path}: line {row.line}: {density} = {value:g} is outside the range [0, inf) of single "
                 "precision"
             )
-        elif counts_beams and row.values[_SAMPLING] == 0:
-            dropped["not sampled"] += 1
-        elif row.values.get(_GROUND_DISTANCE, 0.0) < 0:
-            dropped["below the ground"] += int(value > 0)
+        is_sampled = not counts_beams or row.values[_SAMPLING] > 0
+        if row.values.get(_GROUND_DISTANCE, 0.0) < 0:
+            # No plants grow there, sampled or not.
+            dropped["below the ground"] += int((value if is_sampled and not np.isnan(value) else fill) > 0)
             densities[row.voxel] = 0.0
+        elif np.isnan(value):
+            dropped["without a density"] += 1
+        elif not is_sampled:
+            dropped["not sampled"] += 1
         else:
             densities[row.voxel] = value
     # Sparse maps have no row of voxels that no beam sampled.

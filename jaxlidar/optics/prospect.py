@@ -11,9 +11,9 @@ transmittance,
 
     R, T = plate_model(k, N, leaf_surface(n, alpha)).
 
-K_i and n are interpolated linearly between the table's wavelengths. All traits but N act through k alone, so
-that derivatives are a chain: dR/dc_i = (dR/dk) K_i/N, and in N at constant c_i, (dR/dN at constant k) -
-(dR/dk) k/N.
+K_i and n are interpolated linearly between the table's wavelengths; where one of these is traced, derivatives
+are the means of those on both sides. All traits but N act through k alone, so that derivatives are a chain:
+dR/dc_i = (dR/dk) K_i/N, and in N at constant c_i, (dR/dN at constant k) - (dR/dk) k/N.
 
 The versions differ in their coefficients and in their traits (RSE: Remote Sens. Environ.):
 
@@ -59,6 +59,7 @@ from jaxlidar._ranges import Range, check_ranges
 from jaxlidar.optics.coefficients import TRAITS, Coefficients, shipped
 from jaxlidar.optics.leaf_surface import LeafSurface, leaf_surface
 from jaxlidar.optics.plate_model import plate_model, plate_model_slopes
+from jaxlidar.optics.spectra import interpolate
 
 _DEFAULTS = {
     "Cab": 40.0,
@@ -259,11 +260,11 @@ def material(leaf: Prospect, wavelengths: Any) -> tuple[Array, LeafSurface]:
     table = shipped(leaf.version) if leaf.coefficients is None else leaf.coefficients
     dtype = leaf.N.dtype
     if isinstance(wavelengths, Tracer):
-        outside = {"left": jnp.nan, "right": jnp.nan}
         grid = jnp.asarray(table.wavelength, dtype)
         x = wavelengths.astype(dtype)
         columns = [
-            jnp.interp(x, grid, jnp.asarray(c, dtype), **outside) for c in (table.index, *table.absorption)
+            interpolate(x, grid, jnp.asarray(c, dtype), outside=jnp.nan)
+            for c in (table.index, *table.absorption)
         ]
         return jnp.stack(columns[1:]), leaf_surface(columns[0], leaf.alpha)
     x = as_numpy(wavelengths, "wavelengths")

@@ -52,7 +52,8 @@ _LARGEST_SINGLE = float(np.finfo(np.float32).max)
 class Spectrum(eqx.Module):
     """A reflectance spectrum, linear between its samples: `spectrum(wavelength)` is the reflectance.
 
-    All fields but `name` are arrays and differentiable.
+    All fields but `name` are arrays and differentiable. The derivative with respect to the wavelength is at a
+    sample the mean of those on both sides.
 
     **Arguments:**
 
@@ -120,7 +121,24 @@ class Spectrum(eqx.Module):
         if table is not None:
             field = f"wavelength of the spectrum {self.name!r}" if self.name else "wavelength"
             check_range(field, wavelength, table[0], table[-1])
-        return self.scale * jnp.interp(wavelength, self.wavelength, self.reflectance)
+        return self.scale * interpolate(wavelength, self.wavelength, self.reflectance)
+
+
+def interpolate(
+    x: Float[Array, "..."],
+    nodes: Float[Array, " nodes"],
+    values: Float[Array, " nodes"],
+    outside: float | None = None,
+) -> Float[Array, "..."]:
+    """Interpolate linearly between nodes; the derivative at a node is the mean of those on both sides.
+
+    **Arguments:** `outside`: value outside of the nodes. Default None: those of the ends.
+    """
+    # At a node, `jnp.interp` has the slope to its right, and along the reversed axis that to its left. Lidar
+    # wavelengths usually are nodes: one-sided slopes would not be those that differences show.
+    rising = jnp.interp(x, nodes, values, left=outside, right=outside)
+    falling = jnp.interp(-x, -nodes[::-1], values[::-1], left=outside, right=outside)
+    return 0.5 * (rising + falling)
 
 
 def reflectance_at(

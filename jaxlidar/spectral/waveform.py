@@ -10,6 +10,7 @@ spread it over samples.
 
 import dataclasses
 import os
+from collections.abc import Callable
 from typing import Any, final
 
 import equinox as eqx
@@ -143,7 +144,7 @@ class Waveform(eqx.Module):
         """
         save_result(self, path, case)
 
-    def returns(self, lidar: Lidar, detector: str = "peak", **options: Any) -> Any:
+    def returns(self, lidar: Lidar, detector: str | Callable[..., Any] = "peak", **options: Any) -> Any:
         """Detect the discrete returns of the waveform, as a laser scanner reports them.
 
         **Arguments:**

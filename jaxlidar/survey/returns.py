@@ -11,9 +11,12 @@ With the sample times t_j and a record y(t) in J per sample, less its background
   below half of that. Its time is that of the crossing.
 - **decomposition**: the record is fitted by copies of the pulse, which may be broadened
   (`inversion.gaussian_decomposition`).
+- **a function of one's own** gives the times of the returns of each record. Amplitude, width and extent of a
+  return are those about the largest sample among those that are nearer to its time than to another return's,
+  and no farther from it than the pulse is long.
 
-**Calibration.** A detector reads another time than the pulse's time zero: the time of its peak, or of a
-level on its leading edge, interpolated between samples. What it reads of the pulse itself, scaled to the
+**Calibration.** A detector by name reads another time than the pulse's time zero: the time of its peak, or of
+a level on its leading edge, interpolated between samples. What it reads of the pulse itself, scaled to the
 amplitude of the return and sampled at the same phase, is subtracted. Phases are tabulated in eighths of a
 sample, which leaves a flat target perpendicular to the beam an error of range of at most some per cent of a
 sample, where the pulse is smooth, and of less than half a sample at the peak of a pulse of constant power.
@@ -34,7 +37,7 @@ Source: Wagner et al. (2004), Int. Arch. Photogramm. Remote Sens. 35, part B3, 2
 import dataclasses
 import os
 from collections.abc import Callable, Iterator, Mapping
-from typing import Any, NamedTuple, final
+from typing import Any, NamedTuple, TypeAlias, final
 
 import equinox as eqx
 import numpy as np
@@ -47,6 +50,7 @@ from jaxlidar._checks import (
     check_integer,
     check_kind,
     check_number,
+    check_numbers,
     check_range,
 )
 from jaxlidar._constants import SPEED_OF_LIGHT
@@ -60,6 +64,8 @@ from jaxlidar.survey.acquisition import PULSE_OVERSAMPLING, Acquisition, acquisi
 from jaxlidar.survey.progress import ProgressClock, SurveyProgress
 
 DETECTORS = ("peak", "constant fraction", "leading edge", "decomposition")
+# A function of the times, samples and noise of one record, (samples,) each, which gives times of returns.
+DetectorFunction: TypeAlias = Callable[[np.ndarray, np.ndarray, np.ndarray], Any]
 # Largest number of returns of a pulse that LAS 1.4 holds.
 MAX_LAS_RETURNS = 15
 # Threshold in standard deviations of the noise, and over the largest sample of the shot.
@@ -76,6 +82,8 @@ _LOGARITHM_FLOOR = 0.01
 _CLIPPING, _ONE_SIGMA_BELOW, _MAX_CLIPPINGS = 3.0, 0.15866, 20
 # Relative differences of the samples of a plateau: rounding, and the range, by which energy falls.
 _PLATEAU_DIFFERENCE = 1e-4
+# Rounding, in samples, of the times that a function gives in single precision.
+_ROUNDING_OF_TIMES = 1e-3
 # Samples that are worked on at once: arrays of less than a megabyte stay in a processor's cache.
 _SAMPLES_AT_ONCE = 100_000
 # Records that are decomposed together, by one compiled program; fewer are filled up with empty ones.
@@ -450,14 +458,7 @@ def _find_echoes(
         return _Echoes(none, empty, empty, empty, none, none)
 
     position, amplitude = _apex(flat, peaks.index)
-    half_width_before = position - _crossing(flat, peaks.index, -1, 0.5 * amplitude, peaks.before)
-    half_width_after = _crossing(flat, peaks.index, 1, 0.5 * amplitude, peaks.after) - position
-    # One side alone falls to half where echoes overlap. If neither does, the dips bound the echo.
-    half_width_before = np.where(np.isnan(half_width_before), half_width_after, half_width_before)
-    half_width_after = np.where(np.isnan(half_width_after), half_width_before, half_width_after)
-    full_width = half_width_before + half_width_after
-    full_width = np.where(np.isnan(full_width), peaks.after - peaks.before, full_width)
-
+    full_width = _full_widths(flat, peaks, position, amplitude)
     if detector == "constant fraction":
         position = _crossing(flat, peaks.index, -1, fraction * amplitude, peaks.before)
     elif detector == "leading edge":
@@ -467,13 +468,93 @@ def _find_echoes(
         position = _crossing(flat, peaks.first, -1, crossed, peaks.before, logarithmic=True)
         fraction = crossed / first_amplitude
     position = _calibrated(detector, position, _readings_of_pulse(detector, pulse, fraction))
-
-    floor = np.maximum(noise.max(axis=1), _RELATIVE_FLOOR * largest)
-    start, end = _extents(padded, peaks, floor)
+    start, end = _extents(padded, peaks, noise)
     first_sample = peaks.row * width + 1
     return _Echoes(
         peaks.row, position - first_sample, amplitude, full_width, start - first_sample, end - first_sample
     )
+
+
+def _find_echoes_by_function(
+    detector: DetectorFunction,
+    time: Float[np.ndarray, " samples"],
+    record: Float[np.ndarray, "shots samples"],
+    noise: Float[np.ndarray, "..."],
+    first_shot: int,
+    pulse_length: int,
+) -> _Echoes:
+    """Take the times of echoes from a function, and measure the records about them.
+
+    **Arguments:** `noise`: as for `_find_echoes`. `first_shot`: number of the first record, for messages.
+    `pulse_length`: in samples.
+    """
+    samples, step = time.size, _sample_interval(time)
+    sigma = np.broadcast_to(noise, record.shape)
+    positions = [
+        (_detected_times(detector, time, power, sigma[i], first_shot + i) - time[0]) / step
+        for i, power in enumerate(record)
+    ]
+    row = np.repeat(np.arange(len(record)), [len(p) for p in positions])
+    position = np.concatenate(positions)
+    # Samples that are nearer to an echo than to its neighbours, and within a pulse's length of it.
+    start = np.maximum(np.ceil(position - pulse_length), 0).astype(int)
+    end = np.minimum(np.floor(position + pulse_length) + 1, samples).astype(int)
+    (pair,) = np.nonzero(row[1:] == row[:-1])
+    middle = np.ceil(0.5 * (position[pair] + position[pair + 1])).astype(int)
+    end[pair], start[pair + 1] = np.minimum(end[pair], middle), np.maximum(start[pair + 1], middle)
+    padded = np.pad(record, ((0, 0), (1, 1)))
+    width, flat = samples + 2, padded.ravel()
+    first_sample = row * width + 1
+    index = _first_minimum(-flat, first_sample + start, first_sample + end) if row.size else row
+    is_light = flat[index] > 0
+    row, position, index, first_sample = (a[is_light] for a in (row, position, index, first_sample))
+    before, after = _bounds(flat, index, row, width)
+    peaks = _Peaks(index, row, index, before, after)
+    apex, amplitude = _apex(flat, index)
+    full_width = _full_widths(flat, peaks, apex, amplitude)
+    start, end = _extents(padded, peaks, noise)
+    return _Echoes(row, position, amplitude, full_width, start - first_sample, end - first_sample)
+
+
+def _detected_times(
+    detector: DetectorFunction, time: np.ndarray, power: np.ndarray, noise: np.ndarray, shot: int
+) -> Float[np.ndarray, " returns"]:
+    """Call a detector on one record, and check what it gives: times in order, without NaN."""
+    detected = detector(time, power, noise)
+    check_numbers("what detector returns", detected)
+    times = np.asarray(detected, float)
+    if times.ndim != 1:
+        raise ValueError(
+            f"detector returns shape {times.shape} for shot {shot}; admissible is (returns,): times in ns"
+        )
+    times, step = np.sort(times[~np.isnan(times)]), _sample_interval(time)
+    # Times of single precision are rounded.
+    margin = _ROUNDING_OF_TIMES * step
+    check_range(f"time that detector returns for shot {shot}", times, time[0] - margin, time[-1] + margin)
+    is_close = np.diff(times) < step - margin
+    if np.any(is_close):
+        i = int(np.argmax(is_close))
+        raise ValueError(
+            f"detector returns {times[i]:g} and {times[i + 1]:g} ns for shot {shot}; admissible are times a "
+            f"sample, {step:g} ns, or more apart"
+        )
+    return np.clip(times, time[0], time[-1])
+
+
+def _sample_interval(time: Float[np.ndarray, " samples"]) -> float:
+    """Return the time from sample to sample, ns; 1 for a record of a single sample."""
+    return float(time[-1] - time[0]) / (time.size - 1) if time.size > 1 else 1.0
+
+
+def _full_widths(flat: np.ndarray, peaks: _Peaks, position: np.ndarray, amplitude: np.ndarray) -> np.ndarray:
+    """Return full widths at half maximum, in samples, of echoes with their apex at `position`."""
+    half_width_before = position - _crossing(flat, peaks.index, -1, 0.5 * amplitude, peaks.before)
+    half_width_after = _crossing(flat, peaks.index, 1, 0.5 * amplitude, peaks.after) - position
+    # One side alone falls to half where echoes overlap. If neither does, the dips bound the echo.
+    half_width_before = np.where(np.isnan(half_width_before), half_width_after, half_width_before)
+    half_width_after = np.where(np.isnan(half_width_after), half_width_before, half_width_after)
+    full_width = half_width_before + half_width_after
+    return np.where(np.isnan(full_width), peaks.after - peaks.before, full_width)
 
 
 def _group_maxima(
@@ -522,12 +603,20 @@ def _group_maxima(
             dip = np.minimum.reduceat(dip, remaining)
             maximum, row, height, level = (a[remaining] for a in (maximum, row, height, level))
         index = first = maximum
+    before, after = _bounds(flat, index, row, width)
+    return _Peaks(index, row, first, before, after)
+
+
+def _bounds(
+    flat: np.ndarray, index: np.ndarray, row: np.ndarray, width: int
+) -> tuple[Int[np.ndarray, " echoes"], Int[np.ndarray, " echoes"]]:
+    """Return the lowest samples between echoes and their neighbours, or the ends of the record."""
     before, after = row * width, (row + 1) * width - 1
     (pair,) = np.nonzero(row[1:] == row[:-1])
     if pair.size:
         lowest = _first_minimum(flat, index[pair], index[pair + 1])
         after[pair] = before[pair + 1] = lowest
-    return _Peaks(index, row, first, before, after)
+    return before, after
 
 
 def _first_minimum(flat: np.ndarray, start: np.ndarray, end: np.ndarray) -> np.ndarray:
@@ -665,9 +754,10 @@ def _latest_time_zero(position: np.ndarray, readings: np.ndarray) -> np.ndarray:
 
 
 def _extents(
-    padded: np.ndarray, peaks: _Peaks, floor: np.ndarray
+    padded: np.ndarray, peaks: _Peaks, noise: np.ndarray
 ) -> tuple[Int[np.ndarray, " echoes"], Int[np.ndarray, " echoes"]]:
     """Return the first sample of each echo and the one after its last, as indices of the flat records."""
+    floor = np.maximum(noise.max(axis=1), _RELATIVE_FLOOR * padded.max(axis=1))
     # The zeros before and after each record are never above the floor.
     low = np.flatnonzero(padded <= floor[:, None])
     following = np.searchsorted(low, peaks.index, "right")
@@ -693,7 +783,7 @@ def _sums_over_extents(array: np.ndarray, echoes: _Echoes) -> Float[np.ndarray, 
 
 def returns_of(
     waves: DetectorInput,
-    detector: str,
+    detector: str | DetectorFunction,
     *,
     record: Any = None,
     background: Any = None,
@@ -704,7 +794,12 @@ def returns_of(
     progress: Callable[[SurveyProgress], None] | None = None,
 ) -> DiscreteReturns:
     """Detect the returns of waveforms. Arguments are those of `Waveforms.returns`."""
-    check_choice("detector", detector, DETECTORS)
+    if not callable(detector):
+        check_choice("detector", detector, DETECTORS)
+    elif threshold is not None:
+        raise ValueError(
+            "threshold is given, but detector is a function; admissible is a function that applies its own"
+        )
     check_number("fraction", fraction, 0.0, 1.0, low_open=True, high_open=True)
     check_kind("progress", progress, Callable | None, "a function, or None")
     if max_returns is not None:
@@ -733,7 +828,7 @@ def returns_of(
 class _Settings(NamedTuple):
     """Arguments of detection: (shots,) or (shots, samples), or None for the default."""
 
-    detector: str
+    detector: str | DetectorFunction
     fraction: float
     background: np.ndarray | None
     noise: np.ndarray | None
@@ -826,10 +921,14 @@ def _energy_per_reflectance(waves: DetectorInput, shots: slice) -> Float[np.ndar
 def _detect_chunk(
     waves: DetectorInput, record: np.ndarray, shots: slice, settings: _Settings, is_own_record: bool
 ) -> dict[str, np.ndarray]:
-    """Return the columns of the returns of a chunk of shots, which the first three detectors find."""
+    """Return the columns of the returns of a chunk of shots, found by all but the decomposition."""
     record, noise, threshold = _prepare_chunk(waves, record, shots, settings, is_own_record)
-    pulse = waves.acquisition.pulse
-    echoes = _find_echoes(settings.detector, record, noise, threshold, settings.fraction, pulse)
+    pulse, detector = waves.acquisition.pulse, settings.detector
+    if isinstance(detector, str):
+        echoes = _find_echoes(detector, record, noise, threshold, settings.fraction, pulse)
+    else:
+        length = -(-pulse.size // PULSE_OVERSAMPLING)
+        echoes = _find_echoes_by_function(detector, waves.time, record, noise, shots.start, length)
     return _columns(waves, record, shots, echoes)
 
 

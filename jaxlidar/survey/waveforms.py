@@ -29,6 +29,7 @@ from jaxlidar.survey.progress import SurveyProgress
 from jaxlidar.survey.results import OPTIONAL_ARRAYS
 from jaxlidar.survey.returns import (
     MAX_LAS_RETURNS,
+    DetectorFunction,
     DiscreteReturns,
     airborne_shots,
     input_of_waveform,
@@ -223,7 +224,7 @@ class Waveforms(eqx.Module):
 
     def returns(
         self,
-        detector: str = "peak",
+        detector: str | DetectorFunction = "peak",
         *,
         wavelength: ArrayLike | None = None,
         record: Float[ArrayLike, "shots wavelengths samples"] | None = None,
@@ -236,13 +237,18 @@ class Waveforms(eqx.Module):
     ) -> DiscreteReturns:
         """Detect the discrete returns of all shots, as a laser scanner reports them.
 
-        `jaxlidar.survey.returns` states the detectors. All are calibrated by the pulse: a smooth one leaves a
-        flat target across the beam an error of range of at most some per cent of a sample.
+        `jaxlidar.survey.returns` states the detectors. Those with a name are calibrated by the pulse: a
+        smooth one leaves a flat target across the beam an error of range of at most some per cent of a
+        sample.
 
         **Arguments:**
 
         - `detector`: "peak", "constant fraction" or "leading edge"; or "decomposition" into echoes of the
-          pulse's shape, which needs `import inversion` and some milliseconds per shot. Default "peak".
+          pulse's shape, which needs `import inversion` and some milliseconds per shot; or a function of one
+          record's times in ns, samples in J without background, and their noise, NumPy arrays of
+          (samples,). It gives the times of the returns in ns, (returns,), a sample or more apart. NaN
+          stands for no return, so that compiled functions can give as many times for every record. Times
+          about which no sample is above zero are left out. Default "peak".
         - `wavelength`: nm, of the channel that detects, one of `wavelength`. Default None: the first.
         - `record`: (shots, wavelengths, samples) J, one that `jaxlidar.record` gave, with its noise.
           Default None: `recorded`.
@@ -254,7 +260,7 @@ class Waveforms(eqx.Module):
           neighbouring samples.
         - `threshold`: lowest amplitude of a return, and lowest rise of one above the dip before it, in J
           per sample, positive, one number or (shots,). Default None: the larger of five times the noise,
-          and 1 % of the shot's largest sample.
+          and 1 % of the shot's largest sample. A function applies its own: None alone is admissible.
         - `fraction`: level of "constant fraction" on the leading edge, over the amplitude, in (0, 1).
           Default 0.5.
         - `max_returns`: of a shot with more, the strongest so many are returned. Default None: all.
@@ -262,8 +268,10 @@ class Waveforms(eqx.Module):
 
         **Returns:** a `DiscreteReturns`.
 
-        **Raises:** ValueError for arguments outside their ranges or of other shapes, and for waveforms of a
-        file of an earlier version; RuntimeError for "decomposition" where `inversion` is not imported.
+        **Raises:** ValueError for arguments outside their ranges or of other shapes, for waveforms of a
+        file of an earlier version, and for times that a function gives outside of the record or in another
+          shape; TypeError for a detector that is neither a name nor a function; RuntimeError for
+          "decomposition" where `inversion` is not imported.
 
         **Example:**
 
@@ -322,7 +330,12 @@ class Waveforms(eqx.Module):
         return true_returns_of(input_of_waveforms(self, wavelength), min_reflectance=min_reflectance)
 
     def to_las(
-        self, path: str | os.PathLike[str], *, crs: str | None = None, detector: str = "peak", **options: Any
+        self,
+        path: str | os.PathLike[str],
+        *,
+        crs: str | None = None,
+        detector: str | DetectorFunction = "peak",
+        **options: Any,
     ) -> DiscreteReturns:
         """Write the discrete returns of all shots as a LAS or LAZ file, version 1.4.
 
@@ -355,7 +368,7 @@ class Waveforms(eqx.Module):
         path: str | os.PathLike[str],
         *,
         crs: str | None = None,
-        detector: str = "peak",
+        detector: str | DetectorFunction = "peak",
         point_format: int = 9,
         **options: Any,
     ) -> DiscreteReturns:
@@ -465,7 +478,13 @@ keep_as_netcdf(
 
 @detect_returns.register
 def _returns_of_waveform(
-    wave: Waveform, lidar: Lidar, detector: str, *, record: Any = None, wavelength: Any = None, **options: Any
+    wave: Waveform,
+    lidar: Lidar,
+    detector: str | DetectorFunction,
+    *,
+    record: Any = None,
+    wavelength: Any = None,
+    **options: Any,
 ) -> DiscreteReturns:
     """Detect the returns of one waveform; see `Waveform.returns`."""
     waves = input_of_waveform(wave, lidar, wavelength)

@@ -259,3 +259,62 @@ def test_first_return_window_is_differentiable_under_jit():
 def test_first_return_window_refuses(time, interval, message):
     with pytest.raises(ValueError, match=message):
         first_return_window(time, jnp.ones((1, 4)), interval)
+
+
+# -- noise models of one's own -----------------------------------------------------------------------------
+
+
+def excess_noise(key, energy, wavelength):
+    """Normal noise of four times the variance of photons."""
+    photon = PLANCK_TIMES_LIGHT / wavelength
+    return energy + 2.0 * jnp.sqrt(photon * energy) * jax.random.normal(key, energy.shape)
+
+
+def test_a_noise_model_replaces_the_noise_of_the_receiver():
+    """Its mean and variance are those of the function; z-test over 20,000 draws, against a planted fault."""
+    n, photons = 20_000, 1e3
+    energy = np.broadcast_to(photons * PHOTON[:, None], (2, n))
+    receiver = Receiver(background=photons * float(PHOTON[0]), electronic_noise=float(PHOTON[0]))
+    samples = record(energy, WAVELENGTH, receiver, key=jax.random.key(3), noise_model=excess_noise)
+    counts = np.asarray(samples, float) / PHOTON[:, None]
+    expected = photons * (1.0 + PHOTON[0] / PHOTON)
+    for variance, is_right in ((4.0 * expected, True), (expected, False)):
+        z_mean = (counts.mean(1) - expected) / np.sqrt(4.0 * expected / n)
+        z_variance = (counts.var(1, ddof=1) - variance) / (variance * np.sqrt(2.0 / n))
+        assert np.abs(z_mean).max() < Z_LIMIT
+        assert bool(np.abs(z_variance).max() < Z_LIMIT) is is_right
+
+
+def test_saturation_threshold_and_quantisation_follow_a_noise_model_in_numpy():
+    def offset(key, energy, wavelength):
+        assert wavelength.shape == (1, 1)
+        return np.asarray(energy) + np.array([-2.0, 0.3, 5.0])
+
+    receiver = Receiver(saturation=7.0, bits=3, detection_threshold=1.0)
+    samples = record(np.array([[2.0, 2.0, 4.0]]), 532.0, receiver, key=jax.random.key(0), noise_model=offset)
+    np.testing.assert_allclose(samples, [[0.0, 2.0, 7.0]])
+
+
+def test_a_noise_model_is_differentiable_and_compiled():
+    @jax.jit
+    def total(energy):
+        key = jax.random.key(0)
+        return jnp.sum(record(energy, 532.0, key=key, noise_model=lambda key, e, wavelength: 3.0 * e))
+
+    np.testing.assert_allclose(jax.grad(total)(jnp.ones((1, 4))), 3.0, rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "error", "message"),
+    [
+        ({"noise_model": "normal"}, TypeError, "noise_model"),
+        ({"noise_model": excess_noise, "key": None}, ValueError, "admissible is one with a key"),
+        ({"noise_model": excess_noise, "mode": "photons"}, ValueError, "where mode = 'waveform'"),
+        ({"noise_model": lambda key, e, w: e[0]}, ValueError, r"shape \(3,\); admissible is \(1, 3\)"),
+        ({"noise_model": lambda key, e, w: None}, TypeError, "what noise_model returns is None"),
+        ({"noise_model": excess_noise, "key": 3}, TypeError, "key"),
+    ],
+)
+def test_other_noise_models_are_refused(arguments, error, message):
+    with pytest.raises(error, match=message):
+        record(np.ones((1, 3)), 532.0, **{"key": jax.random.key(0), **arguments})

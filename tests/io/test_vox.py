@@ -197,3 +197,45 @@ def test_the_recorded_map_of_helios(shared):
     assert sum(dropped.values()) == 0
     expected = jl.LeafAngles.named("planophile").probability
     np.testing.assert_allclose(voxels.leaf_angles.probability, expected)
+
+
+GROUND = """VOXEL SPACE
+#min_corner:(0,0,0)
+#max_corner:(1,1,5)
+#split:(1,1,5)
+i j k ground_distance nbSampling PadBVTotal
+0 0 0 -1.5 0 0
+0 0 1 -0.5 0 NaN
+0 0 2 -0.1 4 0
+0 0 3 0.5 0 NaN
+0 0 4 1.5 4 1.0
+"""
+
+
+@pytest.mark.parametrize(("fill", "below"), [(0.0, 0), (0.8, 2)])
+def test_voxels_below_the_ground_are_not_filled(tmp_path, fill, below):
+    path = tmp_path / "a.vox"
+    path.write_text(GROUND)
+    voxels, dropped = read_vox(path, fill=fill)
+    np.testing.assert_allclose(voxels.leaf[0, 0], 0.5 * np.array([0.0, 0.0, 0.0, fill, 1.0]))
+    assert dropped == {"not sampled": 0, "without a density": 1, "below the ground": below}
+
+
+@pytest.mark.parametrize(
+    ("kind", "name", "other"), [("WAD", "bark", "leaf"), ("wad", "bark", "leaf"), ("LAD", "leaf", "bark")]
+)
+def test_the_type_of_area_is_that_of_the_material(tmp_path, kind, name, other):
+    path = tmp_path / "a.vox"
+    path.write_text(GROUND.replace("#split", f"#type:{kind}\n#split"))
+    voxels, _ = read_vox(path, name=name)
+    assert float(getattr(voxels, name).sum()) > 0
+    assert getattr(voxels, other) is None
+    with pytest.raises(ValueError, match=rf"line 4: type = {kind}, with name = '{other}'; give"):
+        read_vox(path, name=other)
+
+
+def test_plant_area_stands_for_either_material(tmp_path):
+    path = tmp_path / "a.vox"
+    path.write_text(GROUND.replace("#split", "#type:PAD\n#split"))
+    for name in ("leaf", "bark"):
+        assert float(getattr(read_vox(path, name=name)[0], name).sum()) > 0

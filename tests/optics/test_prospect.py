@@ -298,3 +298,17 @@ def test_shipped_tables_equal_prosail(version, name):
         # prosail stores its version 5 in single precision.
         np.testing.assert_allclose(column, getattr(prosail_table, columns[trait]), rtol=1e-7)
     np.testing.assert_allclose(table.index, prosail_table.nr, rtol=1e-7)
+
+
+def test_the_derivative_by_a_tabulated_wavelength_is_that_of_central_differences():
+    """At 700 nm, where chlorophyll's absorption falls steeply, one-sided slopes differ by 5 % and more."""
+    leaf, step = Prospect(), 0.5
+    with jax.enable_x64():
+        leaf = jax.tree.map(lambda a: jnp.asarray(a, jnp.float64), leaf)
+        at = jax.jit(lambda wavelength: jnp.stack(leaf(wavelength)))
+        slope = jax.jacfwd(at)(jnp.float64(700.0))
+        difference = (at(jnp.float64(700.0 + step)) - at(jnp.float64(700.0 - step))) / (2.0 * step)
+        one_sided = (at(jnp.float64(700.0 + step)) - at(jnp.float64(700.0))) / step
+        np.testing.assert_allclose(at(jnp.float64(700.0)), leaf(700.0), rtol=1e-10)
+    np.testing.assert_allclose(slope, difference, rtol=5e-3)
+    assert np.all(np.abs(np.asarray(one_sided / difference) - 1.0) > 0.02)

@@ -171,3 +171,15 @@ def test_no_text(tmp_path):
         read_spectrum_csv(path)
     with pytest.raises(FileNotFoundError, match=r"none\.csv"):
         read_spectrum_csv(tmp_path / "none.csv")
+
+
+def test_the_derivative_at_a_sample_is_that_of_central_differences():
+    """Values at samples are those of the table; one-sided slopes would be 0.002 and -0.00025."""
+    own = Spectrum(WAVELENGTH, REFLECTANCE)
+    np.testing.assert_array_equal(own(500.0), own.reflectance[1])
+    np.testing.assert_allclose(own(WAVELENGTH), own.reflectance, rtol=2e-7)
+    slope = jax.grad(lambda wavelength: own(wavelength))
+    difference = (own(510.0) - own(490.0)) / 20.0
+    np.testing.assert_allclose(slope(500.0), difference, rtol=1e-4)
+    np.testing.assert_allclose(slope(500.0), 0.5 * (0.2 / 100.0 - 0.1 / 400.0), rtol=1e-5)
+    np.testing.assert_allclose([slope(499.0), slope(501.0)], [0.2 / 100.0, -0.1 / 400.0], rtol=1e-4)

@@ -3,6 +3,7 @@
 import dataclasses
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -321,11 +322,68 @@ def test_positions_follow_from_the_two_way_time():
         ({"record": np.zeros((2, 1, 5))}, "record has shape"),
         ({"wavelength": 532.0}, "wavelength = 532 nm is none of"),
         ({"max_returns": 0}, "max_returns = 0 is outside"),
+        ({"detector": lambda *_: np.zeros((1, 2))}, r"detector returns shape \(1, 2\) for shot 0"),
+        ({"detector": lambda *_: 3.0}, r"detector returns shape \(\) for shot 0"),
+        ({"detector": lambda time, *_: time[-1:] + 5.0}, "time that detector returns for shot 0"),
+        ({"detector": lambda time, *_: time[5] + np.array([0.0, 0.1])}, "a sample, .* ns, or more apart"),
+        ({"detector": lambda time, *_: time[:1], "threshold": 1.0}, "threshold is given"),
     ],
 )
 def test_wrong_arguments_are_refused(waveforms, arguments, message):
     with pytest.raises(ValueError, match=message):
         waveforms.returns(**arguments)
+
+
+def test_a_function_measures_the_record_as_peaks_do(waveforms):
+    """Given the times that "peak" finds, in any order, a function yields the same returns."""
+    peaks = waveforms.returns("peak")
+    shots = iter(np.split(peaks.time, np.flatnonzero(np.diff(peaks.shot)) + 1))
+    returns = waveforms.returns(lambda time, power, noise: next(shots)[::-1])
+    for name, values in vars(peaks).items():
+        if np.asarray(values).dtype.kind == "f":
+            np.testing.assert_allclose(getattr(returns, name), values, rtol=1e-6, err_msg=name)
+        else:
+            np.testing.assert_array_equal(getattr(returns, name), values, err_msg=name)
+
+
+def test_a_compiled_function_gives_times_and_nan_for_none(waveforms):
+    @jax.jit
+    def largest(time, power, noise):
+        return jnp.stack([time[jnp.argmax(power)], jnp.nan])
+
+    returns = waveforms.returns(largest)
+    assert set(returns.n_returns.tolist()) == {1}
+    highest = np.argmax(waveforms.recorded[:, 0], axis=-1)
+    np.testing.assert_allclose(returns.time, np.asarray(waveforms.time)[highest], atol=1e-3)
+    np.testing.assert_allclose(returns.amplitude, waveforms.recorded[:, 0].max(axis=-1), rtol=0.1)
+    assert set(returns.material.tolist()) == {"plate"}
+
+
+def test_a_function_gets_samples_without_background_and_their_noise(waveforms):
+    seen = []
+
+    def keep(time, power, noise):
+        seen.append((time, power, noise))
+        return np.zeros(0)
+
+    record = np.asarray(waveforms.recorded) + 3e-15
+    returns = waveforms.returns(keep, record=record, background=3e-15, noise=2e-17)
+    assert (len(returns), returns.n_shots, len(seen)) == (0, len(waveforms), len(waveforms))
+    time, power, noise = seen[1]
+    np.testing.assert_array_equal(time, waveforms.time)
+    np.testing.assert_allclose(power, waveforms.recorded[1, 0], atol=1e-6 * record.max())
+    np.testing.assert_allclose(noise, np.full(time.size, 2e-17), rtol=1e-6)
+    # Where no sample is above zero there is no return.
+    far_from_light = [int(np.argmin(power))]
+    assert len(waveforms.returns(lambda time, power, noise: time[far_from_light], record=0.0 * record)) == 0
+
+
+@pytest.mark.parametrize("detector", [3, None, np.zeros(2)])
+def test_a_detector_is_a_name_or_a_function(waveforms, detector):
+    with pytest.raises(TypeError, match="detector"):
+        waveforms.returns(detector)
+    with pytest.raises(TypeError, match="what detector returns is None"):
+        waveforms.returns(lambda *_: None)
 
 
 def test_truth_is_needed_for_true_returns(waveforms):
