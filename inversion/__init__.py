@@ -54,9 +54,6 @@
 `files`.
 """
 
-import warnings
-from typing import Any
-
 from inversion import files
 from inversion.fit.design import Design, design
 from inversion.fit.fit_summary import Step
@@ -185,13 +182,3 @@ shorten_signatures(globals())
 def __dir__() -> list[str]:
     # Public names alone, without the modules and helpers that the imports leave here.
     return sorted(__all__)
-
-
-def __getattr__(name: str) -> Any:
-    if name == "Progress":
-        message = (
-            "inversion.Progress is renamed: use inversion.RetrievalProgress; the old name goes with the next"
-        )
-        warnings.warn(f"{message} version", DeprecationWarning, stacklevel=2)
-        return RetrievalProgress
-    raise AttributeError(f"module 'inversion' has no attribute {name!r}")

@@ -85,7 +85,6 @@ from jaxlidar import extend, io
 from jaxlidar._checks import UnitWarning
 from jaxlidar._compilation_cache import CompilationCache, compilation_cache
 from jaxlidar._constants import SPEED_OF_LIGHT
-from jaxlidar._deprecated import RENAMED, warn_renamed
 from jaxlidar._fingerprint import version_of
 from jaxlidar._progress import Progress
 from jaxlidar._registry import register_public_objects, waveform_html
@@ -334,7 +333,4 @@ def _waveform_html(wave: Waveform) -> str:
 def __getattr__(name: str) -> Any:
     if name == "plot":
         return importlib.import_module("jaxlidar.plot")
-    if name in RENAMED:
-        warn_renamed(f"jaxlidar.{name}", f"jaxlidar.{RENAMED[name]}")
-        return globals()[RENAMED[name]]
     raise AttributeError(f"module 'jaxlidar' has no attribute {name!r}")

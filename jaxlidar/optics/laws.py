@@ -37,12 +37,11 @@ from jaxtyping import Array, Float
 
 from jaxlidar._checks import briefly, scalar
 from jaxlidar._converted import Converted
-from jaxlidar._deprecated import RenamedMethods
 from jaxlidar._ranges import Range, check_ranges
 from jaxlidar._vectors import Scalar, Vec, about, cross, dot, from_frame, polar, vec
 
 
-class AbstractLaw(RenamedMethods, eqx.Module):
+class AbstractLaw(eqx.Module):
     """A law of reflection: how a surface distributes the light that it reflects over directions.
 
     A law of your own is one class in one file: derive it from this, give its five methods, and pass it as

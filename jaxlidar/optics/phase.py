@@ -25,7 +25,6 @@ from jaxtyping import Array, Float
 
 from jaxlidar._checks import array, briefly, scalar
 from jaxlidar._converted import Converted
-from jaxlidar._deprecated import RenamedMethods
 from jaxlidar._ranges import FRACTION, Range, check_ranges
 from jaxlidar._vectors import Scalar, Vec, dot, from_frame, polar
 
@@ -33,7 +32,7 @@ from jaxlidar._vectors import Scalar, Vec, dot, from_frame, polar
 ISOTROPIC_INTENSITY_FACTOR = 0.25
 
 
-class AbstractPhase(RenamedMethods, eqx.Module):
+class AbstractPhase(eqx.Module):
     """A phase function with its single scattering albedo: how a volume scatters light.
 
     A phase function of your own is one class in one file: derive it from this, give its three methods

@@ -22,7 +22,6 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from jaxlidar._checks import briefly, check_flag, check_key, check_kind
-from jaxlidar._deprecated import renamed_property
 from jaxlidar._mesh_axes import vary_together, vary_with, with_automatic_axes
 from jaxlidar._products import einsum, tensordot
 from jaxlidar.planning.setup import Setup
@@ -80,7 +79,6 @@ class Response(eqx.Module):
     escaped: Float[Array, "traces histories"]
     late: Float[Array, "traces histories"]
     remaining: Float[Array, "traces histories"]
-    left = renamed_property("left", "departed")
 
 
 @with_automatic_axes
