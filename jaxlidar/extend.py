@@ -6,8 +6,7 @@ For laws, pulses and surfaces of your own, and for packages on top such as `inve
   elements unless these stand for missing numbers; `check_range`, `check_number`, `check_integer`,
   `check_choice` refuse values, `check_kind`, `check_numbers`, `check_key` objects of another type; `concrete`
   returns the value of an array, or None where a JAX transformation is tracing it; `even_step` the step of
-  times or heights, and refuses uneven ones;
-  `Converted[T]` is the type of a field with a converter, for mypy.
+  times or heights, and refuses uneven ones.
 - directions: a `Vec` is a tuple of three arrays, x, y and z; `dot`, `scale`, `add`, `normalise`; `polar` and
   `from_frame` make directions about an axis, `about` draws one by the cosine law.
 - ranges: a class states them by field, `ranges = {"slope": Range(0.0, 90.0)}`; its constructor calls
@@ -40,7 +39,6 @@ from jaxlidar._checks import (
     concrete,
     even_step,
 )
-from jaxlidar._converted import Converted
 from jaxlidar._fingerprint import fingerprint
 from jaxlidar._one_function import once
 from jaxlidar._products import einsum, matmul, tensordot
@@ -67,7 +65,6 @@ from jaxlidar.scenes.scene import check_kinds
 
 __all__ = [
     "ONE_CORE",
-    "Converted",
     "Range",
     "Scalar",
     "Vec",

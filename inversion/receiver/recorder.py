@@ -19,7 +19,6 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from jaxlidar.extend import (
-    Converted,
     as_array,
     as_numpy,
     as_scalar,
@@ -85,15 +84,11 @@ class Recorder(eqx.Module):
 
     width: BoundPair | None = eqx.field(static=True, default=None)
     delay: BoundPair | None = eqx.field(static=True, default=None, kw_only=True)
-    impulse: Converted[Float[Array, " lags"] | None] = eqx.field(converter=_optional_impulse, default=None)
+    impulse: Float[Array, " lags"] | None = eqx.field(converter=_optional_impulse, default=None)
     offset: BoundPair | None = eqx.field(static=True, default=None)
     interleaved: int = eqx.field(static=True, default=1)
-    pulse_noise: Converted[Float[Array, ""]] = eqx.field(
-        converter=lambda x: as_scalar(x, "pulse_noise"), default=0.0
-    )
-    correlation: Converted[Float[Array, ""]] = eqx.field(
-        converter=lambda x: as_scalar(x, "correlation"), default=0.0
-    )
+    pulse_noise: Float[Array, ""] = eqx.field(converter=lambda x: as_scalar(x, "pulse_noise"), default=0.0)
+    correlation: Float[Array, ""] = eqx.field(converter=lambda x: as_scalar(x, "correlation"), default=0.0)
 
     def __check_init__(self):
         for field, low in (("width", 0.0), ("delay", -np.inf), ("offset", -np.inf)):

@@ -46,7 +46,6 @@ from jaxlidar._checks import (
     scalar,
 )
 from jaxlidar._constants import PLANCK_TIMES_LIGHT, SPEED_OF_LIGHT
-from jaxlidar._converted import Converted
 from jaxlidar._ranges import FRACTION, Range, check_ranges
 from jaxlidar._registry import save_result
 from jaxlidar._signatures import briefly
@@ -100,15 +99,13 @@ class PhotonCounter(eqx.Module):
     """
 
     pixels: int = eqx.field(static=True, default=16)
-    dead_time: Converted[Float[Array, ""]] = eqx.field(converter=scalar("dead_time"), default=3.2)
-    detection_probability: Converted[Float[Array, "..."]] = eqx.field(
+    dead_time: Float[Array, ""] = eqx.field(converter=scalar("dead_time"), default=3.2)
+    detection_probability: Float[Array, "..."] = eqx.field(
         converter=array("detection_probability"), default=1.0
     )
-    background_rate: Converted[Float[Array, "..."]] = eqx.field(
-        converter=array("background_rate"), default=0.0
-    )
-    jitter: Converted[Float[Array, ""]] = eqx.field(converter=scalar("jitter"), default=0.0)
-    window: Converted[Float[Array, "..."] | None] = eqx.field(converter=_window, default=None)
+    background_rate: Float[Array, "..."] = eqx.field(converter=array("background_rate"), default=0.0)
+    jitter: Float[Array, ""] = eqx.field(converter=scalar("jitter"), default=0.0)
+    window: Float[Array, "..."] | None = eqx.field(converter=_window, default=None)
 
     ranges: ClassVar = {
         "dead_time": Range(0.0),

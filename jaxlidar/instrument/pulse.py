@@ -39,7 +39,6 @@ from jax.scipy.special import erfc
 from jaxtyping import Array, ArrayLike, Float
 
 from jaxlidar._checks import as_array, as_scalar, check_range, concrete, scalar, warn_units
-from jaxlidar._converted import Converted
 from jaxlidar._ranges import Range, check_ranges
 from jaxlidar._signatures import briefly
 
@@ -154,7 +153,7 @@ class GaussianPulse(AbstractPulse):
     0.500
     """
 
-    fwhm: Converted[Float[Array, ""]] = eqx.field(converter=scalar("fwhm"), default=6.0)
+    fwhm: Float[Array, ""] = eqx.field(converter=scalar("fwhm"), default=6.0)
 
     ranges: ClassVar = {"fwhm": Range(0.0)}
 
@@ -202,7 +201,7 @@ class RectangularPulse(AbstractPulse):
     1.732 ns, 0.75 of the energy by 1.5 ns
     """
 
-    length: Converted[Float[Array, ""]] = eqx.field(converter=scalar("length"), default=6.0)
+    length: Float[Array, ""] = eqx.field(converter=scalar("length"), default=6.0)
 
     ranges: ClassVar = {"length": Range(0.0)}
 
@@ -254,8 +253,8 @@ class ExponentiallyModifiedGaussianPulse(AbstractPulse):
     0.570 of the energy, standard deviation 2.371 ns
     """
 
-    fwhm: Converted[Float[Array, ""]] = eqx.field(converter=scalar("fwhm"))
-    decay: Converted[Float[Array, ""]] = eqx.field(converter=scalar("decay"))
+    fwhm: Float[Array, ""] = eqx.field(converter=scalar("fwhm"))
+    decay: Float[Array, ""] = eqx.field(converter=scalar("decay"))
 
     ranges: ClassVar = {"fwhm": Range(0.0), "decay": Range(0.0)}
 

@@ -20,7 +20,6 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxlidar._checks import as_numpy, check_choice, check_number, concrete, is_masked
-from jaxlidar._converted import Converted
 
 # Largest angle between a beam and the vertical, degrees.
 MAX_ZENITH = 89.0
@@ -82,8 +81,8 @@ class Oscillating(AbstractScan):
     [[0.0, 0.0, 1.0], [0.0, 0.5, 0.866], [0.0, -0.5, 0.866]]
     """
 
-    half_angle: Converted[float] = eqx.field(converter=_as_float)
-    frequency: Converted[float] = eqx.field(converter=_as_float)
+    half_angle: float = eqx.field(converter=_as_float)
+    frequency: float = eqx.field(converter=_as_float)
     motion: str = eqx.field(static=True, default="sine")
 
     def __check_init__(self):
@@ -121,8 +120,8 @@ class RotatingPolygon(AbstractScan):
     [[0.0, -0.5, 0.866], [0.0, 0.0, 1.0]]
     """
 
-    half_angle: Converted[float] = eqx.field(converter=_as_float)
-    line_rate: Converted[float] = eqx.field(converter=_as_float)
+    half_angle: float = eqx.field(converter=_as_float)
+    line_rate: float = eqx.field(converter=_as_float)
 
     def __check_init__(self):
         _check_pattern(self.half_angle, "line_rate", self.line_rate)
@@ -154,8 +153,8 @@ class Conical(AbstractScan):
     [[0.5, 0.0, 0.866], [0.0, 0.5, 0.866]]
     """
 
-    half_angle: Converted[float] = eqx.field(converter=_as_float)
-    frequency: Converted[float] = eqx.field(converter=_as_float)
+    half_angle: float = eqx.field(converter=_as_float)
+    frequency: float = eqx.field(converter=_as_float)
 
     def __check_init__(self):
         _check_pattern(self.half_angle, "frequency", self.frequency)

@@ -36,7 +36,6 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxlidar._checks import briefly, scalar
-from jaxlidar._converted import Converted
 from jaxlidar._ranges import Range, check_ranges
 from jaxlidar._vectors import Scalar, Vec, about, cross, dot, from_frame, polar, vec
 
@@ -261,7 +260,7 @@ class Specular(AbstractMirror):
     50.0
     """
 
-    roughness: Converted[Float[Array, ""]] = eqx.field(converter=scalar("roughness"), default=0.0)
+    roughness: Float[Array, ""] = eqx.field(converter=scalar("roughness"), default=0.0)
 
     ranges: ClassVar = {"roughness": Range(0.0, 0.5)}
 

@@ -30,7 +30,6 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxlidar._checks import array, as_scalar, briefly, check_choice, check_range, concrete
-from jaxlidar._converted import Converted
 from jaxlidar._products import matmul
 from jaxlidar._ranges import Range, check_ranges
 
@@ -65,7 +64,7 @@ class LeafAngles(eqx.Module):
     0.849
     """
 
-    probability: Converted[Float[Array, "90"]] = eqx.field(converter=array("probability"))
+    probability: Float[Array, "90"] = eqx.field(converter=array("probability"))
 
     ranges: ClassVar = {"probability": Range(0.0)}
 

@@ -24,7 +24,6 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxlidar._checks import array, briefly, scalar
-from jaxlidar._converted import Converted
 from jaxlidar._ranges import FRACTION, Range, check_ranges
 from jaxlidar._vectors import Scalar, Vec, dot, from_frame, polar
 
@@ -131,7 +130,7 @@ class Isotropic(AbstractPhase):
     ['0.1', '0.9']
     """
 
-    albedo: Converted[Float[Array, "..."]] = eqx.field(converter=array("albedo"))
+    albedo: Float[Array, "..."] = eqx.field(converter=array("albedo"))
 
     ranges: ClassVar = {"albedo": FRACTION}
 
@@ -176,8 +175,8 @@ class HenyeyGreenstein(AbstractPhase):
     1.500 forward, 0.056 back
     """
 
-    albedo: Converted[Float[Array, "..."]] = eqx.field(converter=array("albedo"))
-    g: Converted[Float[Array, ""]] = eqx.field(converter=scalar("g"), default=0.0)
+    albedo: Float[Array, "..."] = eqx.field(converter=array("albedo"))
+    g: Float[Array, ""] = eqx.field(converter=scalar("g"), default=0.0)
 
     ranges: ClassVar = {"albedo": FRACTION, "g": Range(-0.95, 0.95)}
 

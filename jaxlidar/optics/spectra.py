@@ -40,7 +40,6 @@ from jaxlidar._checks import (
     scalar,
     warn_units,
 )
-from jaxlidar._converted import Converted
 from jaxlidar._ranges import FRACTION, SUM_OF_FRACTIONS, Range, check_ranges
 
 # The largest wavelength, nm, that is finite in single precision.
@@ -73,10 +72,10 @@ class Spectrum(eqx.Module):
     0.305
     """
 
-    wavelength: Converted[Float[Array, " samples"]] = eqx.field(converter=array("wavelength"))
-    reflectance: Converted[Float[Array, " samples"]] = eqx.field(converter=array("reflectance"))
+    wavelength: Float[Array, " samples"] = eqx.field(converter=array("wavelength"))
+    reflectance: Float[Array, " samples"] = eqx.field(converter=array("reflectance"))
     name: str = eqx.field(static=True, default="")
-    scale: Converted[Float[Array, ""]] = eqx.field(converter=scalar("scale"), default=1.0)
+    scale: Float[Array, ""] = eqx.field(converter=scalar("scale"), default=1.0)
 
     ranges: ClassVar = {
         "wavelength": Range(0.0, low_open=True, increasing=True),

@@ -23,7 +23,6 @@ from jaxlidar._checks import (
     concrete,
     kind_of,
 )
-from jaxlidar._converted import Converted
 from jaxlidar._ranges import FRACTION
 from jaxlidar._signatures import briefly
 from jaxlidar._text import object_text
@@ -76,7 +75,7 @@ class Canopy(eqx.Module):
 
     voxels: VoxelMap
     leaf: Callable | AbstractPhase | None = None
-    bark: Converted[Reflectance | AbstractPhase | None] = eqx.field(converter=_as_bark, default=None)
+    bark: Reflectance | AbstractPhase | None = eqx.field(converter=_as_bark, default=None)
     transmission: str = eqx.field(static=True, default="diffuse")
     hotspot: bool = eqx.field(static=True, default=True)
     sides: str = eqx.field(static=True, default="open")

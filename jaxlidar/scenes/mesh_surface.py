@@ -32,7 +32,6 @@ from jaxlidar._checks import (
     is_traced,
     kind_of,
 )
-from jaxlidar._converted import Converted
 from jaxlidar._products import einsum, matmul
 from jaxlidar._ranges import SUM_OF_FRACTIONS, Range, check_ranges
 from jaxlidar._signatures import briefly
@@ -378,7 +377,7 @@ class MeshMaterial(AbstractSheet):
     mesh: MeshSurface
     label: str = eqx.field(static=True)
     transmission: str = eqx.field(static=True, default="diffuse")
-    coverage: Converted[Float[Array, ""]] = eqx.field(converter=as_scalar, default=1.0)
+    coverage: Float[Array, ""] = eqx.field(converter=as_scalar, default=1.0)
 
     @property
     def name(self) -> str:

@@ -11,7 +11,6 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxlidar._checks import check_kind, concrete, is_traced, kind_of
-from jaxlidar._converted import Converted
 from jaxlidar._ranges import Range
 from jaxlidar._signatures import briefly
 from jaxlidar._text import object_text
@@ -68,10 +67,10 @@ class Scene(eqx.Module):
     """
 
     canopy: Canopy | None = None
-    plates: Converted[tuple[AbstractSheet, ...]] = eqx.field(converter=_as_tuple, default=())
+    plates: tuple[AbstractSheet, ...] = eqx.field(converter=_as_tuple, default=())
     ground: AbstractGround | None = None
     atmosphere: Atmosphere | None = None
-    meshes: Converted[tuple[MeshSurface, ...]] = eqx.field(converter=_as_tuple, default=())
+    meshes: tuple[MeshSurface, ...] = eqx.field(converter=_as_tuple, default=())
 
     ranges: ClassVar = {"gap": Range(MIN_GAP)}
 

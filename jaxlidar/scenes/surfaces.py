@@ -30,7 +30,6 @@ from jaxlidar._checks import (
     coordinates,
     scalar,
 )
-from jaxlidar._converted import Converted
 from jaxlidar._ranges import FRACTION, SUM_OF_FRACTIONS, Range, check_ranges
 from jaxlidar._signatures import briefly
 from jaxlidar._text import object_text
@@ -250,12 +249,12 @@ class Ground(AbstractGround):
     normal: -0.342 north, 0.940 up
     """
 
-    height: Converted[Float[Array, ""]] = eqx.field(converter=scalar("height"), default=0.0)
-    reflectance: Converted[Reflectance] = eqx.field(converter=reflectance_field("reflectance"), default=0.3)
-    slope: Converted[Float[Array, ""]] = eqx.field(converter=scalar("slope"), default=0.0)
-    aspect: Converted[Float[Array, ""]] = eqx.field(converter=scalar("aspect"), default=0.0)
+    height: Float[Array, ""] = eqx.field(converter=scalar("height"), default=0.0)
+    reflectance: Reflectance = eqx.field(converter=reflectance_field("reflectance"), default=0.3)
+    slope: Float[Array, ""] = eqx.field(converter=scalar("slope"), default=0.0)
+    aspect: Float[Array, ""] = eqx.field(converter=scalar("aspect"), default=0.0)
     law: AbstractLaw = Lambertian()
-    position: Converted[Float[Array | np.ndarray, " 2"]] = eqx.field(
+    position: Float[Array | np.ndarray, " 2"] = eqx.field(
         converter=coordinates("position", 2), default=(0.0, 0.0)
     )
 
@@ -313,17 +312,15 @@ class Plate(AbstractSheet):
     0.15 of the light is absorbed
     """
 
-    height: Converted[Float[Array, ""]] = eqx.field(converter=scalar("height"))
-    reflectance: Converted[Reflectance] = eqx.field(converter=reflectance_field("reflectance"))
-    transmittance: Converted[Reflectance] = eqx.field(
-        converter=reflectance_field("transmittance"), default=0.0
-    )
-    coverage: Converted[Float[Array, ""]] = eqx.field(converter=scalar("coverage"), default=1.0)
-    slope: Converted[Float[Array, ""]] = eqx.field(converter=scalar("slope"), default=0.0)
-    aspect: Converted[Float[Array, ""]] = eqx.field(converter=scalar("aspect"), default=0.0)
+    height: Float[Array, ""] = eqx.field(converter=scalar("height"))
+    reflectance: Reflectance = eqx.field(converter=reflectance_field("reflectance"))
+    transmittance: Reflectance = eqx.field(converter=reflectance_field("transmittance"), default=0.0)
+    coverage: Float[Array, ""] = eqx.field(converter=scalar("coverage"), default=1.0)
+    slope: Float[Array, ""] = eqx.field(converter=scalar("slope"), default=0.0)
+    aspect: Float[Array, ""] = eqx.field(converter=scalar("aspect"), default=0.0)
     transmission: str = eqx.field(static=True, default="straight")
     law: AbstractLaw = Lambertian()
-    position: Converted[Float[Array | np.ndarray, " 2"]] = eqx.field(
+    position: Float[Array | np.ndarray, " 2"] = eqx.field(
         converter=coordinates("position", 2), default=(0.0, 0.0)
     )
 

@@ -26,7 +26,6 @@ from jaxlidar._checks import (
     coordinates,
     warn_units,
 )
-from jaxlidar._converted import Converted
 from jaxlidar._ranges import Range, check_ranges
 from jaxlidar._signatures import briefly
 from jaxlidar._text import object_text
@@ -94,10 +93,10 @@ class VoxelMap(eqx.Module):
     """
 
     # The shapes are not part of the types: the constructor compares them, and its error names both.
-    leaf: Converted[Float[Array, "..."] | None] = eqx.field(converter=_volume("leaf"))
-    bark: Converted[Float[Array, "..."] | None] = eqx.field(converter=_volume("bark"))
-    voxel_size: Converted[Float[Array, "3"]] = eqx.field(converter=_triple("voxel_size"))
-    origin: Converted[Float[Array | np.ndarray, "3"]] = eqx.field(converter=coordinates("origin", 3))
+    leaf: Float[Array, "..."] | None = eqx.field(converter=_volume("leaf"))
+    bark: Float[Array, "..."] | None = eqx.field(converter=_volume("bark"))
+    voxel_size: Float[Array, "3"] = eqx.field(converter=_triple("voxel_size"))
+    origin: Float[Array | np.ndarray, "3"] = eqx.field(converter=coordinates("origin", 3))
     leaf_angles: LeafAngles | None = None
 
     ranges: ClassVar = {
