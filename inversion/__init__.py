@@ -90,7 +90,6 @@ from inversion.scene.clumps import clumped_leaves
 from inversion.scene.geolocation import Geolocation, geolocate
 from inversion.scene.retrieval import SceneStep, retrieve_scene
 from inversion.scene.scene_retrieval import SceneRetrieval
-from jaxlidar.extend import shorten_signatures
 
 __all__ = [
     # Fits with a model.
@@ -175,8 +174,6 @@ __all__ = [
     # Files.
     "files",
 ]
-
-shorten_signatures(globals())
 
 
 def __dir__() -> list[str]:

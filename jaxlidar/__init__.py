@@ -88,7 +88,6 @@ from jaxlidar._constants import SPEED_OF_LIGHT
 from jaxlidar._fingerprint import version_of
 from jaxlidar._progress import Progress
 from jaxlidar._registry import register_public_objects, waveform_html
-from jaxlidar._signatures import shorten_signatures
 from jaxlidar._workers import LostWorkersWarning
 from jaxlidar.analog import AnalogReturns, analog_returns, photon_paths
 from jaxlidar.energy import EnergyBudget, energy_budget
@@ -309,8 +308,6 @@ __all__ = [
 ]
 
 __version__ = version_of("jaxlidar")
-
-shorten_signatures(globals())
 
 
 def __dir__() -> list[str]:

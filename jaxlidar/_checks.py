@@ -22,8 +22,6 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Float
 
-# For modules that take all helpers of construction from here.
-from jaxlidar._signatures import briefly  # noqa: F401
 from jaxlidar._text import number_text
 
 # Largest distance of times or heights from evenly spaced ones, over their step.

@@ -13,8 +13,6 @@ For laws, pulses and surfaces of your own, and for packages on top such as `inve
   `check_ranges`; where JAX is tracing, `inadmissible` detects values outside of them and `reasons` tells
   which.
 - `check_kinds` refuses objects that are not a lidar and a scene.
-- `briefly` shortens the signature that `help` shows of a function or a class, `shorten_signatures` those of a
-  package.
 - `fingerprint` is a hash of everything that a result depends on, to compare with that of a stored result.
 - `once` is an optimisation barrier: the compiler computes its arguments once, instead of again in each
   expression that uses them.
@@ -44,7 +42,6 @@ from jaxlidar._one_function import once
 from jaxlidar._products import einsum, matmul, tensordot
 from jaxlidar._ranges import Range, check_ranges, inadmissible, reasons
 from jaxlidar._registry import decompose_records
-from jaxlidar._signatures import briefly, shorten_signatures
 from jaxlidar._threads import ONE_CORE, side_by_side
 from jaxlidar._vectors import (
     Scalar,
@@ -74,7 +71,6 @@ __all__ = [
     "as_array",
     "as_numpy",
     "as_scalar",
-    "briefly",
     "check_choice",
     "check_integer",
     "check_key",
@@ -100,11 +96,8 @@ __all__ = [
     "polar",
     "reasons",
     "scale",
-    "shorten_signatures",
     "side_by_side",
     "task",
     "tensordot",
     "vec",
 ]
-
-shorten_signatures(globals(), converters=("as_array", "as_scalar"))

@@ -22,7 +22,6 @@ from jaxlidar.extend import (
     as_array,
     as_numpy,
     as_scalar,
-    briefly,
     check_integer,
     check_number,
     check_range,
@@ -39,7 +38,6 @@ def _optional_impulse(x: Any) -> Array | None:
 
 
 @final
-@briefly
 class Recorder(eqx.Module):
     """Receiver and digitisers of a recorder, for `retrieve` and `retrieve_many`. Its gain is their `scale`.
 

@@ -41,7 +41,6 @@ from jaxlidar._checks import (
     warn_units,
 )
 from jaxlidar._ranges import Range, check_ranges
-from jaxlidar._signatures import briefly
 from jaxlidar._text import object_text
 from jaxlidar.instrument.photon_counter import PhotonCounter
 from jaxlidar.instrument.pulse import AbstractPulse, GaussianPulse
@@ -99,7 +98,6 @@ def _slant_range(altitude: Float[Array, ""], zenith: Float[Array, ""]) -> Float[
 
 
 @final
-@briefly
 class Lidar(eqx.Module):
     """A full-waveform lidar: its position and pointing, beam, pulse and receiver.
 

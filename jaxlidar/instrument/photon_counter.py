@@ -48,7 +48,6 @@ from jaxlidar._checks import (
 from jaxlidar._constants import PLANCK_TIMES_LIGHT, SPEED_OF_LIGHT
 from jaxlidar._ranges import FRACTION, Range, check_ranges
 from jaxlidar._registry import save_result
-from jaxlidar._signatures import briefly
 
 # More events would exceed the memory; more arrivals could not be counted exactly in double precision.
 _MAX_EVENTS = 1e8
@@ -66,7 +65,6 @@ def _window(x: Any) -> Float[Array, "..."] | None:
 
 
 @final
-@briefly
 class PhotonCounter(eqx.Module):
     """A receiver that counts photons. The default has the 16 pixels and the dead time of ATLAS' strong beams
     (ICESat-2; its weak beams have 4 pixels), detects all photons, and has no background and no jitter.
@@ -129,7 +127,6 @@ class PhotonCounter(eqx.Module):
 
 
 @final
-@briefly
 class PhotonEvents(eqx.Module):
     """Events of a photon counter, in the order of shots, pulses and times. `len(events)` is their number.
 

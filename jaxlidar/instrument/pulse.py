@@ -40,7 +40,6 @@ from jaxtyping import Array, ArrayLike, Float
 
 from jaxlidar._checks import as_array, as_scalar, check_range, concrete, scalar, warn_units
 from jaxlidar._ranges import Range, check_ranges
-from jaxlidar._signatures import briefly
 
 _FWHM_PER_SIGMA = 2 * math.sqrt(2 * math.log(2))
 # Extents of `support` in standard deviations and in mean lives. A normal variable lies outside +-5.5 sigma
@@ -134,7 +133,6 @@ class AbstractPulse(eqx.Module):
 
 
 @final
-@briefly
 class GaussianPulse(AbstractPulse):
     """A Gaussian pulse, centred on time zero.
 
@@ -182,7 +180,6 @@ class GaussianPulse(AbstractPulse):
 
 
 @final
-@briefly
 class RectangularPulse(AbstractPulse):
     """A pulse of constant power, centred on time zero.
 
@@ -230,7 +227,6 @@ class RectangularPulse(AbstractPulse):
 
 
 @final
-@briefly
 class ExponentiallyModifiedGaussianPulse(AbstractPulse):
     """A Gaussian convolved with a decaying exponential: a pulse with a sharp rise and a long tail.
 
@@ -286,7 +282,6 @@ class ExponentiallyModifiedGaussianPulse(AbstractPulse):
 
 
 @final
-@briefly
 class SampledPulse(AbstractPulse):
     """A recorded transmit waveform: linear between its samples, zero outside, scaled to unit area.
 

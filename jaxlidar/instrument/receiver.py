@@ -44,7 +44,6 @@ from jaxlidar._constants import PLANCK_TIMES_LIGHT
 from jaxlidar._not_kept import check_kept
 from jaxlidar._products import einsum
 from jaxlidar._ranges import Range, check_ranges
-from jaxlidar._signatures import briefly
 from jaxlidar.instrument.photon_counter import (
     MAX_NEGATIVE_FRACTION,
     PhotonCounter,
@@ -62,7 +61,6 @@ Wavelengths: TypeAlias = ArrayLike | Sequence[ArrayLike]
 
 
 @final
-@briefly
 class Receiver(eqx.Module):
     """Detection, noise and digitisation of a waveform. The default is a perfect record.
 

@@ -35,7 +35,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxlidar._checks import briefly, scalar
+from jaxlidar._checks import scalar
 from jaxlidar._ranges import Range, check_ranges
 from jaxlidar._vectors import Scalar, Vec, about, cross, dot, from_frame, polar, vec
 
@@ -158,7 +158,6 @@ class AbstractMirror(AbstractLaw):
 
 
 @final
-@briefly
 class Lambertian(AbstractLaw):
     """Lambertian reflection: equal radiance in all directions of the lit side (intensity by the cosine law).
 
@@ -190,7 +189,6 @@ class Lambertian(AbstractLaw):
 
 
 @final
-@briefly
 class EqualAngle(AbstractLaw):
     """Reflection with a polar angle uniform in [0, 90] degrees: the paper's "every angle equally likely".
 
@@ -234,7 +232,6 @@ def _square_of_sine(normal: Vec, out: Vec) -> Scalar:
 
 
 @final
-@briefly
 class Specular(AbstractMirror):
     """Specular reflection: a mirror of slightly tilted facets, with a Gaussian lobe about its direction.
 

@@ -8,12 +8,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from jaxlidar._checks import array, briefly
+from jaxlidar._checks import array
 from jaxlidar._ranges import FRACTION, SUM_OF_FRACTIONS, check_ranges
 
 
 @final
-@briefly
 class LeafOptics(eqx.Module):
     """Leaf optics from given reflectance and transmittance: `R, T = optics(wavelengths)`, as with `Prospect`.
 

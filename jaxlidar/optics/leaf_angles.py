@@ -29,7 +29,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxlidar._checks import array, as_scalar, briefly, check_choice, check_range, concrete
+from jaxlidar._checks import array, as_scalar, check_choice, check_range, concrete
 from jaxlidar._products import matmul
 from jaxlidar._ranges import Range, check_ranges
 
@@ -39,7 +39,6 @@ ANGLE_NODES = 129
 
 
 @final
-@briefly
 class LeafAngles(eqx.Module):
     """A leaf angle distribution, uniform in azimuth, as probabilities of cells of one degree of inclination.
 

@@ -23,7 +23,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxlidar._checks import array, briefly, scalar
+from jaxlidar._checks import array, scalar
 from jaxlidar._ranges import FRACTION, Range, check_ranges
 from jaxlidar._vectors import Scalar, Vec, dot, from_frame, polar
 
@@ -109,7 +109,6 @@ def _check_phase(phase: AbstractPhase) -> None:
 
 
 @final
-@briefly
 class Isotropic(AbstractPhase):
     """Isotropic volume scattering, the same in all directions: often assumed by discrete ordinates codes.
 
@@ -148,7 +147,6 @@ class Isotropic(AbstractPhase):
 
 
 @final
-@briefly
 class HenyeyGreenstein(AbstractPhase):
     """Volume scattering by Henyey and Greenstein's phase function: a forward or a backward lobe.
 

@@ -32,7 +32,6 @@ from jaxtyping import Array, ArrayLike, Float
 from jaxlidar._checks import (
     array,
     as_array,
-    briefly,
     check_choice,
     check_kind,
     check_range,
@@ -47,7 +46,6 @@ _LARGEST_SINGLE = float(np.finfo(np.float32).max)
 
 
 @final
-@briefly
 class Spectrum(eqx.Module):
     """A reflectance spectrum, linear between its samples: `spectrum(wavelength)` is the reflectance.
 

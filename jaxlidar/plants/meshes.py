@@ -21,7 +21,6 @@ import numpy as np
 from jaxtyping import ArrayLike, Bool, Float, Int
 
 from jaxlidar._checks import (
-    briefly,
     check_integer,
     check_kind,
     check_number,
@@ -48,7 +47,6 @@ _SNAP_DISTANCE = 1e-9
 
 
 @final
-@briefly
 @dataclass(frozen=True, eq=False, init=False)
 class Mesh:
     """A mesh of n triangles over m vertices, each triangle of one of several materials.

@@ -5,7 +5,6 @@ Every function draws on the given axes, or on those of a new figure, and returns
 saves the figure. The package, and matplotlib with it, is imported when it is first used.
 """
 
-from jaxlidar._signatures import shorten_signatures
 from jaxlidar.plot.comparisons import comparison
 from jaxlidar.plot.fits import fit, residuals
 from jaxlidar.plot.light import accuracy, energy_budget
@@ -37,8 +36,6 @@ __all__ = [
     "waterfall",
     "waveform",
 ]
-
-shorten_signatures(globals())
 
 
 def __dir__() -> list[str]:

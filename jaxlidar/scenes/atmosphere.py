@@ -51,7 +51,6 @@ from jaxlidar._checks import (
     warn_units,
 )
 from jaxlidar._ranges import Range, check_ranges
-from jaxlidar._signatures import briefly
 from jaxlidar._text import object_text
 
 # Admissible wavelengths, nm. Peck and Reeder's formula is fitted to 230..1690 nm and smooth far beyond; the
@@ -166,7 +165,6 @@ def aerosol_extinction(
 
 
 @final
-@briefly
 class Atmosphere(eqx.Module):
     """A clear atmosphere: molecules and aerosol whose densities fall exponentially with height.
 

@@ -24,7 +24,6 @@ from jaxlidar._checks import (
     kind_of,
 )
 from jaxlidar._ranges import FRACTION
-from jaxlidar._signatures import briefly
 from jaxlidar._text import object_text
 from jaxlidar.optics.phase import AbstractPhase
 from jaxlidar.optics.spectra import Spectrum, reflectance_at
@@ -37,7 +36,6 @@ def _as_bark(x: Any) -> Any:
 
 
 @final
-@briefly
 class Canopy(eqx.Module):
     """A canopy: leaf and bark in voxels, with their optical properties.
 

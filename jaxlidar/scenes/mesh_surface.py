@@ -34,7 +34,6 @@ from jaxlidar._checks import (
 )
 from jaxlidar._products import einsum, matmul
 from jaxlidar._ranges import SUM_OF_FRACTIONS, Range, check_ranges
-from jaxlidar._signatures import briefly
 from jaxlidar._vectors import FAR, Scalar, Vec, along, dot, vec
 from jaxlidar.optics.laws import AbstractLaw, AbstractMirror, Lambertian
 from jaxlidar.optics.spectra import Spectrum
@@ -81,7 +80,6 @@ def _coordinates(field: str, x: Any, columns: int) -> Array | np.ndarray:
 
 
 @final
-@briefly
 class MeshInstances(eqx.Module):
     """Places of copies of a mesh: each is scaled and rotated about the mesh's own origin, then shifted.
 
@@ -154,7 +152,6 @@ def _matrices(rotation: Any, scale: Any, xp: Any) -> Any:
 
 
 @final
-@briefly
 class MeshSurface(eqx.Module):
     """A surface of triangles that stops light: roofs, trunks, wires, leaves, whole trees.
 

@@ -12,7 +12,6 @@ from jaxtyping import Array, Float
 
 from jaxlidar._checks import check_kind, concrete, is_traced, kind_of
 from jaxlidar._ranges import Range
-from jaxlidar._signatures import briefly
 from jaxlidar._text import object_text
 from jaxlidar._vectors import FAR
 from jaxlidar.instrument.lidar import Lidar
@@ -35,7 +34,6 @@ def _as_tuple(x: Any) -> Any:
 
 
 @final
-@briefly
 class Scene(eqx.Module):
     """A scene: the canopy, plates, ground, atmosphere and meshes that a lidar observes.
 

@@ -31,7 +31,6 @@ from jaxlidar._checks import (
     scalar,
 )
 from jaxlidar._ranges import FRACTION, SUM_OF_FRACTIONS, Range, check_ranges
-from jaxlidar._signatures import briefly
 from jaxlidar._text import object_text
 from jaxlidar.optics.laws import AbstractLaw, Lambertian
 from jaxlidar.optics.spectra import Spectrum
@@ -223,7 +222,6 @@ class AbstractSheet(AbstractSurface):
 
 
 @final
-@briefly
 class Ground(AbstractGround):
     """The ground: an infinite opaque plane, level or sloping.
 
@@ -278,7 +276,6 @@ class Ground(AbstractGround):
 
 
 @final
-@briefly
 class Plate(AbstractSheet):
     """A leaf plate: an infinite sheet with a reflectance and a transmittance, the same on both sides.
 

@@ -34,7 +34,6 @@ from jaxlidar._checks import (
     coordinates,
 )
 from jaxlidar._ranges import FRACTION, Range, check_ranges
-from jaxlidar._signatures import briefly
 from jaxlidar._vectors import normalise
 from jaxlidar.optics.laws import AbstractLaw, AbstractMirror, Lambertian
 from jaxlidar.optics.spectra import Spectrum
@@ -67,7 +66,6 @@ def _pair(field: str) -> Callable[[Any], Float[Array, "2"]]:
 
 
 @final
-@briefly
 class Terrain(AbstractGround):
     """Terrain: an opaque ground whose height is given at the nodes of a grid, and bilinear in between.
 

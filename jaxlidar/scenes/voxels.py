@@ -27,7 +27,6 @@ from jaxlidar._checks import (
     warn_units,
 )
 from jaxlidar._ranges import Range, check_ranges
-from jaxlidar._signatures import briefly
 from jaxlidar._text import object_text
 from jaxlidar.optics.leaf_angles import LeafAngles
 from jaxlidar.scenes.terrain import Terrain
@@ -61,7 +60,6 @@ def _volume(field: str) -> Callable[[Numbers | None], Float[Array, "..."] | None
 
 
 @final
-@briefly
 class VoxelMap(eqx.Module):
     """A voxel map: extinction coefficients of leaf and bark in a box of equal voxels, x east, y north, z up.
 

@@ -17,7 +17,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxlidar._checks import briefly, check_range, is_traced
+from jaxlidar._checks import check_range, is_traced
 from jaxlidar._registry import detect_returns, save_result, true_returns, waveform_html
 from jaxlidar._summary import summary
 from jaxlidar.instrument.lidar import Lidar
@@ -37,7 +37,6 @@ from jaxlidar.trace.response import Response
 
 
 @final
-@briefly
 class Waveform(eqx.Module):
     """A simulated waveform: apparent reflectance and received energy by wavelength and sample.
 

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import ArrayLike, Float, Int
 
-from jaxlidar._checks import briefly, check_numbers
+from jaxlidar._checks import check_numbers
 from jaxlidar._constants import SPEED_OF_LIGHT
 from jaxlidar._not_kept import NotKept
 from jaxlidar._registry import detect_returns, true_returns
@@ -43,7 +43,6 @@ _LEAST_COSINE = 1e-12
 
 
 @final
-@briefly
 class Waveforms(eqx.Module):
     """The waveforms of all shots of a survey, on one time axis. `waves[i]` is the `Waveform` of shot i.
 
