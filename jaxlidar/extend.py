@@ -2,9 +2,9 @@
 
 For laws, pulses and surfaces of your own, and for packages on top such as `inversion`:
 
-- fields: `as_array`, `as_scalar` and, in NumPy's double precision, `as_numpy` convert them, and refuse masked
-  elements unless these stand for missing numbers; `check_range`, `check_number`, `check_integer`,
-  `check_choice` refuse values, `check_kind`, `check_numbers`, `check_key` objects of another type; `concrete`
+- fields: `as_array`, `as_scalar` and, in NumPy's double precision, `as_numpy` convert them, and refuse
+  booleans, times and masked elements; `check_range`, `check_number`, `check_integer`, `check_choice` refuse
+  values, `check_kind`, `check_numbers`, `check_key` objects of another type; `concrete`
   returns the value of an array, or None where a JAX transformation is tracing it; `even_step` the step of
   times or heights, and refuses uneven ones.
 - directions: a `Vec` is a tuple of three arrays, x, y and z; `dot`, `scale`, `add`, `normalise`; `polar` and

@@ -165,7 +165,7 @@ def retrieve_many(
     >>> fits.values["brightness"].round(3).tolist()
     [0.2, 0.4]
     """
-    y = as_numpy(observed, "observed", missing=True)
+    y = as_numpy(observed, "observed")
     if y.ndim != 3 or len(y) == 0:
         raise ValueError(f"observed has the shape {y.shape}; admissible is (footprints, wavelengths, bins)")
     n_footprints, n_wavelengths, n_bins = y.shape

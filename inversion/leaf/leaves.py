@@ -206,7 +206,7 @@ def invert_leaves(
 
     - `wavelengths`: (wavelengths,) nm, in any order, within PROSPECT's 400 to 2500.
     - `reflectance`, `transmittance`: (leaves, wavelengths) fractions, or (wavelengths,) of one leaf; missing
-      samples are NaN or masked. One of the two may be None, but without transmittance the data hardly
+      samples are NaN. One of the two may be None, but without transmittance the data hardly
       separate N from the other traits.
     - `unknowns`: names out of "N" and the traits of the version. Default None: all of them.
     - `leaf`: a `Prospect` that gives the version, alpha and coefficients, the starting values of the unknowns
@@ -394,9 +394,7 @@ def _check_spectra(
     if x.ndim != 1 or x.size == 0:
         raise ValueError(f"wavelengths has the shape {x.shape}; admissible is (wavelengths,), one or more")
     arguments = {"reflectance": reflectance, "transmittance": transmittance}
-    spectra = {
-        name: np.atleast_2d(as_numpy(s, name, missing=True)) for name, s in arguments.items() if s is not None
-    }
+    spectra = {name: np.atleast_2d(as_numpy(s, name)) for name, s in arguments.items() if s is not None}
     if not spectra:
         raise ValueError(
             "reflectance = None and transmittance = None; admissible is an array for one or both"

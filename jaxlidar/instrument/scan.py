@@ -19,7 +19,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
-from jaxlidar._checks import as_numpy, check_choice, check_number, concrete, is_masked
+from jaxlidar._checks import as_numpy, check_choice, check_number, concrete
 
 # Largest angle between a beam and the vertical, degrees.
 MAX_ZENITH = 89.0
@@ -28,7 +28,7 @@ MAX_ZENITH = 89.0
 def _as_float(x: Any) -> Any:
     """Convert one number to a Python float (double precision); other objects are left to the checks."""
     number = concrete(x)
-    return x if number is None or number.ndim or is_masked(x) else float(number)
+    return x if number is None or number.ndim else float(number)
 
 
 class AbstractScan(eqx.Module):

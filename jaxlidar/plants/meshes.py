@@ -27,7 +27,6 @@ from jaxlidar._checks import (
     check_range,
     check_seed,
     check_shape,
-    check_unmasked,
     warn_user,
 )
 from jaxlidar._summary import percent
@@ -86,8 +85,6 @@ class Mesh:
         materials: Sequence[str] = ("mesh",),
     ):
         check_range("vertices", vertices)
-        for name, indices in (("faces", faces), ("material", material)):
-            check_unmasked(name, indices)
         vertices, faces = np.asarray(vertices, float), np.asarray(faces)
         material = np.zeros(len(faces), int) if material is None else np.asarray(material)
         for name, indices in (("faces", faces), ("material", material)):

@@ -26,7 +26,6 @@ from jaxlidar._checks import (
     check_numbers,
     check_range,
     check_shape,
-    check_unmasked,
     concrete,
     concrete_array,
     is_traced,
@@ -331,7 +330,6 @@ def _mesh_arrays(
             "vertices within by equinox.tree_at"
         )
     vertices = as_numpy(vertices, "vertices")
-    check_unmasked("faces", faces)
     faces = np.asarray(faces)
     if faces.dtype.kind not in "iu":
         raise TypeError(f"faces is an array of {faces.dtype}; admissible are integers")
