@@ -445,8 +445,12 @@ MAGNITUDES = {
 }
 
 _PROJECT_PACKAGES = ("jaxlidar", "inversion")
-# Packages between a user's line that constructs an object and the check of its fields.
-_INTERNAL_PACKAGES = (*_PROJECT_PACKAGES, "equinox", "jaxtyping", "beartype", "dataclasses")
+# Packages whose frames lie between a user's line and a warning of the project.
+_INTERNAL_PACKAGES = (
+    *_PROJECT_PACKAGES,
+    *("equinox", "jax", "optimistix", "jaxtyping", "beartype"),
+    *("abc", "contextlib", "dataclasses", "functools"),
+)
 
 
 def warn_units(module: object) -> None:
@@ -480,8 +484,10 @@ def warn_unit(field: str, x: object) -> None:
     warn_user(message, UnitWarning)
 
 
-def warn_user(message: str, category: type[Warning]) -> None:
-    """Warn at the innermost line outside of the project and of the packages that call it back.
+def warn_user(message: str, category: type[Warning] = UserWarning) -> None:
+    """Warn at the user's line: the innermost one outside of the project and of the packages beneath it.
+
+    Python shows a warning by default once for each line that it names.
 
     No warning is given where `dataclasses.replace` within the project copies an object that the user was
     warned of already.

@@ -6,7 +6,7 @@ For laws, pulses and surfaces of your own, and for packages on top such as `inve
   booleans, times and masked elements; `check_range`, `check_number`, `check_integer`, `check_choice` refuse
   values, `check_kind`, `check_numbers`, `check_key` objects of another type; `concrete`
   returns the value of an array, or None where a JAX transformation is tracing it; `even_step` the step of
-  times or heights, and refuses uneven ones.
+  times or heights, and refuses uneven ones. `warn_user` warns at the line of the user's code.
 - directions: a `Vec` is a tuple of three arrays, x, y and z; `dot`, `scale`, `add`, `normalise`; `polar` and
   `from_frame` make directions about an axis, `about` draws one by the cosine law.
 - ranges: a class states them by field, `ranges = {"slope": Range(0.0, 90.0)}`; its constructor calls
@@ -36,6 +36,7 @@ from jaxlidar._checks import (
     check_range,
     concrete,
     even_step,
+    warn_user,
 )
 from jaxlidar._fingerprint import fingerprint
 from jaxlidar._one_function import once
@@ -100,4 +101,5 @@ __all__ = [
     "task",
     "tensordot",
     "vec",
+    "warn_user",
 ]
