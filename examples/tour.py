@@ -1,6 +1,6 @@
 """Simulate, differentiate, fit, fly a survey, draw and save: each once. Run it as `python examples/tour.py`.
 
-A crown stands over a slope. pyright and mypy check this script, as `.ci/run` runs them.
+A crown stands over a slope. pyright checks this script, as `.ci/run` runs it.
 """
 
 import sys

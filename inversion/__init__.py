@@ -54,9 +54,6 @@
 `files`.
 """
 
-import warnings
-from typing import Any
-
 from inversion import files
 from inversion.fit.design import Design, design
 from inversion.fit.fit_summary import Step
@@ -93,7 +90,6 @@ from inversion.scene.clumps import clumped_leaves
 from inversion.scene.geolocation import Geolocation, geolocate
 from inversion.scene.retrieval import SceneStep, retrieve_scene
 from inversion.scene.scene_retrieval import SceneRetrieval
-from jaxlidar.extend import shorten_signatures
 
 __all__ = [
     # Fits with a model.
@@ -179,19 +175,7 @@ __all__ = [
     "files",
 ]
 
-shorten_signatures(globals())
-
 
 def __dir__() -> list[str]:
     # Public names alone, without the modules and helpers that the imports leave here.
     return sorted(__all__)
-
-
-def __getattr__(name: str) -> Any:
-    if name == "Progress":
-        message = (
-            "inversion.Progress is renamed: use inversion.RetrievalProgress; the old name goes with the next"
-        )
-        warnings.warn(f"{message} version", DeprecationWarning, stacklevel=2)
-        return RetrievalProgress
-    raise AttributeError(f"module 'inversion' has no attribute {name!r}")

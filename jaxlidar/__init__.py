@@ -85,11 +85,9 @@ from jaxlidar import extend, io
 from jaxlidar._checks import UnitWarning
 from jaxlidar._compilation_cache import CompilationCache, compilation_cache
 from jaxlidar._constants import SPEED_OF_LIGHT
-from jaxlidar._deprecated import RENAMED, warn_renamed
 from jaxlidar._fingerprint import version_of
 from jaxlidar._progress import Progress
 from jaxlidar._registry import register_public_objects, waveform_html
-from jaxlidar._signatures import shorten_signatures
 from jaxlidar._workers import LostWorkersWarning
 from jaxlidar.analog import AnalogReturns, analog_returns, photon_paths
 from jaxlidar.energy import EnergyBudget, energy_budget
@@ -311,8 +309,6 @@ __all__ = [
 
 __version__ = version_of("jaxlidar")
 
-shorten_signatures(globals())
-
 
 def __dir__() -> list[str]:
     # Public names alone, without the modules and helpers that the imports leave here.
@@ -334,7 +330,4 @@ def _waveform_html(wave: Waveform) -> str:
 def __getattr__(name: str) -> Any:
     if name == "plot":
         return importlib.import_module("jaxlidar.plot")
-    if name in RENAMED:
-        warn_renamed(f"jaxlidar.{name}", f"jaxlidar.{RENAMED[name]}")
-        return globals()[RENAMED[name]]
     raise AttributeError(f"module 'jaxlidar' has no attribute {name!r}")

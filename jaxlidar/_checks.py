@@ -4,9 +4,9 @@ A value outside its range or of the wrong shape raises ValueError; an object of 
 TypeError. A value that is admissible but implausible, as if given in another unit, gives a `UnitWarning`.
 Tracers pass every check of values: inside a JAX transformation values are not known.
 
-Numbers are real: booleans, complex numbers and times of NumPy are of a wrong type. NumPy and JAX drop the
-mask of a masked array without a word, so every argument becomes an array by `as_array` or `as_numpy`: masked
-elements become NaN where that stands for a missing number, and are refused elsewhere.
+Numbers are real: booleans, complex numbers, times of NumPy and masked arrays with masked elements are of a
+wrong type. NumPy and JAX would drop a mask and take booleans and times for numbers without a word, so
+arguments become arrays by `as_array` or `as_numpy`.
 """
 
 import sys
@@ -22,8 +22,6 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Float
 
-# For modules that take all helpers of construction from here.
-from jaxlidar._signatures import briefly  # noqa: F401
 from jaxlidar._text import number_text
 
 # Largest distance of times or heights from evenly spaced ones, over their step.
@@ -45,16 +43,14 @@ def as_optional_scalar(x: ArrayLike | None, field: str = "value") -> Float[Array
     return None if x is None else as_scalar(x, field)
 
 
-def as_array(x: ArrayLike | Sequence, field: str = "value", *, missing: bool = False) -> Float[Array, "..."]:
+def as_array(x: ArrayLike | Sequence, field: str = "value") -> Float[Array, "..."]:
     """Convert to a floating-point JAX array in the default precision; a JAX float array is not changed.
-
-    With `missing`, NaN stands for missing numbers, and masked elements become NaN.
 
     **Raises:** as `check_numbers`.
     """
     if isinstance(x, jax.Array) and jnp.issubdtype(x.dtype, jnp.floating):
         return x
-    check_numbers(field, x, missing=missing)
+    check_numbers(field, x)
     values = concrete(x)
     if values is None:
         return jnp.asarray(x, dtype=float)
@@ -63,15 +59,15 @@ def as_array(x: ArrayLike | Sequence, field: str = "value", *, missing: bool = F
         return jnp.asarray(values.astype(jnp.result_type(float)))
 
 
-def as_numpy(x: Any, field: str = "value", *, missing: bool = False) -> Float[np.ndarray, "..."]:
-    """Convert numbers whose values are known to a NumPy array of float64; arguments as for `as_array`.
+def as_numpy(x: Any, field: str = "value") -> Float[np.ndarray, "..."]:
+    """Convert numbers whose values are known to a NumPy array of float64.
 
     **Raises:** as `check_numbers`; TypeError where JAX is tracing `x`.
     """
-    check_numbers(field, x, missing=missing)
+    check_numbers(field, x)
     if is_traced(x):
         raise TypeError(f"{field} is being traced by a JAX transformation; admissible are known numbers")
-    return np.asarray(_with_nan(x), dtype=float)
+    return np.asarray(x, dtype=float)
 
 
 def scalar(field: str) -> Callable[[ArrayLike], Float[Array, ""]]:
@@ -131,14 +127,11 @@ def is_within_program() -> bool:
 
 
 def concrete(x: object) -> np.ndarray | None:
-    """Convert `x` to a NumPy array of float64; None if it is traced or not numeric, and cannot be checked.
-
-    Masked elements become NaN.
-    """
+    """Convert `x` to a NumPy array of float64; None if it is traced or not numeric, and cannot be checked."""
     if is_traced(x) or not _is_numeric(x):
         return None
     try:
-        return np.asarray(_with_nan(x), dtype=float)
+        return np.asarray(x, dtype=float)
     except (TypeError, ValueError):
         return None
 
@@ -168,8 +161,10 @@ def concrete_array(x: object) -> np.ndarray:
 def _is_numeric(x: object) -> bool:
     """Return True if `x` is a real number, or an array or nested sequence of them, concrete or traced.
 
-    Booleans are none. Neither are times, which NumPy counts among the integers.
+    Booleans are none. Neither are times, which NumPy counts among the integers, and masked elements.
     """
+    if _has_masked_elements(x):
+        return False
     dtype = getattr(x, "dtype", None)
     if isinstance(dtype, np.dtype):
         return dtype.kind in "iu" or bool(jnp.issubdtype(dtype, jnp.floating))
@@ -178,20 +173,8 @@ def _is_numeric(x: object) -> bool:
     return isinstance(x, Real) and not isinstance(x, bool)
 
 
-def is_masked(x: object) -> bool:
-    """Return True if `x` is a masked array with masked elements, or a nested sequence that has one."""
-    if isinstance(x, Sequence) and not isinstance(x, str | bytes):
-        return any(map(is_masked, x))
+def _has_masked_elements(x: object) -> bool:
     return isinstance(x, np.ma.MaskedArray) and bool(np.ma.getmaskarray(x).any())
-
-
-def _with_nan(x: Any) -> Any:
-    """Return numbers with NaN in place of masked elements."""
-    if not is_masked(x):
-        return x
-    if isinstance(x, np.ma.MaskedArray):
-        return np.ma.filled(x.astype(float), np.nan)
-    return [_with_nan(item) for item in x]
 
 
 # -- values ------------------------------------------------------------------------------------------------
@@ -321,6 +304,8 @@ def kind_of(x: object) -> str:
         return "None"
     if isinstance(x, type):
         return f"the class {x.__name__}"
+    if _has_masked_elements(x):
+        return "an array with masked elements"
     if isinstance(x, jax.Array | np.ndarray):
         return f"an array of {x.dtype}{' that JAX is tracing' if is_traced(x) else ''}"
     name = type(x).__name__
@@ -341,26 +326,16 @@ def check_flag(field: str, x: object) -> None:
     check_kind(field, x, bool | np.bool_, "True or False")
 
 
-def check_numbers(field: str, x: object, admissible: str = "real numbers", *, missing: bool = False) -> None:
+def check_numbers(field: str, x: object, admissible: str = "real numbers") -> None:
     """Refuse `x` unless it is a real number, or an array or nested sequence of them, concrete or traced.
 
-    With `missing`, masked elements pass.
-
-    **Raises:** `TypeError` naming `field`, the type of `x` and what is admissible; `ValueError` for masked
-    elements, and for a nested sequence with rows of different lengths.
+    **Raises:** `TypeError` naming `field`, the type of `x` and what is admissible; `ValueError` for a nested
+    sequence with rows of different lengths.
     """
     if not _is_numeric(x):
         raise TypeError(f"{field} is {kind_of(x)}; admissible are {admissible}")
-    if not missing:
-        check_unmasked(field, x)
     if _is_ragged(x):
         raise ValueError(f"{field} has rows of different lengths; admissible is a regular array")
-
-
-def check_unmasked(field: str, x: object) -> None:
-    """Refuse a masked array with masked elements, of whatever type."""
-    if is_masked(x):
-        raise ValueError(f"{field} has masked elements; admissible is an array without a mask")
 
 
 def _is_ragged(x: object) -> bool:
@@ -470,8 +445,12 @@ MAGNITUDES = {
 }
 
 _PROJECT_PACKAGES = ("jaxlidar", "inversion")
-# Packages between a user's line that constructs an object and the check of its fields.
-_INTERNAL_PACKAGES = (*_PROJECT_PACKAGES, "equinox", "jaxtyping", "beartype", "dataclasses")
+# Packages whose frames lie between a user's line and a warning of the project.
+_INTERNAL_PACKAGES = (
+    *_PROJECT_PACKAGES,
+    *("equinox", "jax", "optimistix", "jaxtyping", "beartype"),
+    *("abc", "contextlib", "dataclasses", "functools"),
+)
 
 
 def warn_units(module: object) -> None:
@@ -505,8 +484,10 @@ def warn_unit(field: str, x: object) -> None:
     warn_user(message, UnitWarning)
 
 
-def warn_user(message: str, category: type[Warning]) -> None:
-    """Warn at the innermost line outside of the project and of the packages that call it back.
+def warn_user(message: str, category: type[Warning] = UserWarning) -> None:
+    """Warn at the user's line: the innermost one outside of the project and of the packages beneath it.
+
+    Python shows a warning by default once for each line that it names.
 
     No warning is given where `dataclasses.replace` within the project copies an object that the user was
     warned of already.

@@ -76,6 +76,10 @@ def compilation_cache(folder: str | os.PathLike[str] | None = None) -> Compilati
     on the processor and on your own functions, and are not reused for others. Nothing is removed from the
     folder.
 
+    On a CPU, JAX before 0.11 logs an error for each program that it reads: XLA takes its own tuning options,
+    "prefer-no-gather" and "prefer-no-scatter", for features that the processor lacks. It is harmless, and
+    `jax.config.update("jax_logging_level", "CRITICAL")` hides it, with all others of JAX.
+
     **Arguments:** `folder`: is made if it does not exist; no one else should be able to write to it, as
     programs are run. Default None: the cache that JAX is configured for already, or else "jaxlidar/programs"
     in the user's cache folder.
@@ -102,10 +106,6 @@ def compilation_cache(folder: str | os.PathLike[str] | None = None) -> Compilati
         "jax_compilation_cache_dir": str(path),
         "jax_persistent_cache_min_compile_time_secs": MIN_COMPILE_TIME,
     }
-    if jax.__version_info__ < (0, 11) and jax.config.values.get("jax_logging_level") in (None, "NOTSET"):
-        # These versions log a false error for each program that they read from the cache: XLA compares its
-        # own tuning options with the features of the processor.
-        settings["jax_logging_level"] = "CRITICAL"
     previous = {name: jax.config.values[name] for name in settings}
     _configure(settings)
     return CompilationCache(path, previous)

@@ -12,7 +12,6 @@ import os
 import pickle
 import platform
 import threading
-import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -21,6 +20,7 @@ import jax
 import jax.monitoring
 from jax.experimental import serialize_executable
 
+from jaxlidar._checks import warn_user
 from jaxlidar._files import atomic_write
 from jaxlidar._fingerprint import fingerprint
 
@@ -89,7 +89,7 @@ class ExecutableStore:
             with atomic_write(path) as draft:
                 draft.write_bytes(content)
         except OSError as error:
-            warnings.warn(f"{path}: a compiled program is not kept: {error}", stacklevel=2)
+            warn_user(f"{path}: a compiled program is not kept: {error}")
 
 
 @contextlib.contextmanager

@@ -1,6 +1,5 @@
 """Units of work: run in this process on all cores or devices, or by the workers of an executor."""
 
-import warnings
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, CancelledError, Executor, Future, wait
 from typing import Any, NamedTuple
@@ -10,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PRNGKeyArray
 
+from jaxlidar._checks import warn_user
 from jaxlidar._threads import side_by_side
 
 # Units that an executor is given ahead of its workers: enough to keep many of them busy, few enough that
@@ -109,10 +109,9 @@ def _run_by_workers(units: list[WorkUnit], executor: Executor) -> Iterator[tuple
                 try:
                     running[executor.submit(run_unit, unit)] = unit
                 except (BrokenExecutor, RuntimeError) as error:
-                    warnings.warn(
+                    warn_user(
                         f"executor takes no more work ({error}): remaining tasks are done in this process",
                         LostWorkersWarning,
-                        stacklevel=2,
                     )
                     # Running units are lost with the executor.
                     remaining = [unit, *reversed(waiting), *running.values()]

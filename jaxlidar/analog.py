@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
-from jaxlidar._checks import briefly, check_integer, check_key, check_number
+from jaxlidar._checks import check_integer, check_key, check_number
 from jaxlidar._constants import SPEED_OF_LIGHT
 from jaxlidar._mesh_axes import vary_together, vary_with, with_automatic_axes
 from jaxlidar._vectors import along, dot
@@ -33,7 +33,6 @@ PHOTONS_PER_CHUNK = 512
 
 
 @final
-@briefly
 class AnalogReturns(eqx.Module):
     """Arrival times and weights of photons followed one by one, as `analog_returns` gives them.
 

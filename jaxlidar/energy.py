@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from jaxlidar._checks import briefly, check_choice, check_integer, check_key, check_range, concrete_number
+from jaxlidar._checks import check_choice, check_integer, check_key, check_range, concrete_number
 from jaxlidar._programs import Program
 from jaxlidar._progress import Progress
 from jaxlidar._threads import ONE_CORE, side_by_side
@@ -40,7 +40,6 @@ MAX_FLIGHT_HEIGHTS = 300.0
 
 
 @final
-@briefly
 class EnergyBudget(eqx.Module):
     """Fractions of the emitted energy, (wavelengths,) each.
 

@@ -2,20 +2,17 @@
 
 For laws, pulses and surfaces of your own, and for packages on top such as `inversion`:
 
-- fields: `as_array`, `as_scalar` and, in NumPy's double precision, `as_numpy` convert them, and refuse masked
-  elements unless these stand for missing numbers; `check_range`, `check_number`, `check_integer`,
-  `check_choice` refuse values, `check_kind`, `check_numbers`, `check_key` objects of another type; `concrete`
+- fields: `as_array`, `as_scalar` and, in NumPy's double precision, `as_numpy` convert them, and refuse
+  booleans, times and masked elements; `check_range`, `check_number`, `check_integer`, `check_choice` refuse
+  values, `check_kind`, `check_numbers`, `check_key` objects of another type; `concrete`
   returns the value of an array, or None where a JAX transformation is tracing it; `even_step` the step of
-  times or heights, and refuses uneven ones;
-  `Converted[T]` is the type of a field with a converter, for mypy.
+  times or heights, and refuses uneven ones. `warn_user` warns at the line of the user's code.
 - directions: a `Vec` is a tuple of three arrays, x, y and z; `dot`, `scale`, `add`, `normalise`; `polar` and
   `from_frame` make directions about an axis, `about` draws one by the cosine law.
 - ranges: a class states them by field, `ranges = {"slope": Range(0.0, 90.0)}`; its constructor calls
   `check_ranges`; where JAX is tracing, `inadmissible` detects values outside of them and `reasons` tells
   which.
 - `check_kinds` refuses objects that are not a lidar and a scene.
-- `briefly` shortens the signature that `help` shows of a function or a class, `shorten_signatures` those of a
-  package.
 - `fingerprint` is a hash of everything that a result depends on, to compare with that of a stored result.
 - `once` is an optimisation barrier: the compiler computes its arguments once, instead of again in each
   expression that uses them.
@@ -39,14 +36,13 @@ from jaxlidar._checks import (
     check_range,
     concrete,
     even_step,
+    warn_user,
 )
-from jaxlidar._converted import Converted
 from jaxlidar._fingerprint import fingerprint
 from jaxlidar._one_function import once
 from jaxlidar._products import einsum, matmul, tensordot
 from jaxlidar._ranges import Range, check_ranges, inadmissible, reasons
 from jaxlidar._registry import decompose_records
-from jaxlidar._signatures import briefly, shorten_signatures
 from jaxlidar._threads import ONE_CORE, side_by_side
 from jaxlidar._vectors import (
     Scalar,
@@ -67,7 +63,6 @@ from jaxlidar.scenes.scene import check_kinds
 
 __all__ = [
     "ONE_CORE",
-    "Converted",
     "Range",
     "Scalar",
     "Vec",
@@ -77,7 +72,6 @@ __all__ = [
     "as_array",
     "as_numpy",
     "as_scalar",
-    "briefly",
     "check_choice",
     "check_integer",
     "check_key",
@@ -103,11 +97,9 @@ __all__ = [
     "polar",
     "reasons",
     "scale",
-    "shorten_signatures",
     "side_by_side",
     "task",
     "tensordot",
     "vec",
+    "warn_user",
 ]
-
-shorten_signatures(globals(), converters=("as_array", "as_scalar"))

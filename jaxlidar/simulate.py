@@ -3,7 +3,6 @@
 import dataclasses
 import math
 import time
-import warnings
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any, NamedTuple
 
@@ -21,6 +20,7 @@ from jaxlidar._checks import (
     check_shape,
     is_traced,
     is_within_program,
+    warn_user,
 )
 from jaxlidar._mesh_axes import vary_with, with_automatic_axes
 from jaxlidar._progress import Progress
@@ -299,15 +299,13 @@ def _make_waveform(tracer: BatchTracer, result: _BatchResults, goal: _Goal) -> W
     )
     if plan.scope.automatic_window and late_fraction(wave) >= NOTABLE_FRACTION:
         end = plan.sample_start + plan.sample_interval * plan.n_samples
-        warnings.warn(
+        warn_user(
             f"{percent(late_fraction(wave))} of the light is still on its way when the record ends at "
             f"{end:.4g} ns: give window=, or see Waveform.energy_budget",
             LateLightWarning,
-            stacklevel=3,
         )
     if result.neglected_fraction > goal.tolerance(plan):
-        message = unfollowed_message(plan.orders, result.neglected_fraction)
-        warnings.warn(message, UnfollowedLightWarning, stacklevel=3)
+        warn_user(unfollowed_message(plan.orders, result.neglected_fraction), UnfollowedLightWarning)
     return open_at_first_return(wave, lidar) if lidar.opens_at_first_return else wave
 
 

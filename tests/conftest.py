@@ -10,7 +10,7 @@ import jax
 import pytest
 from jaxtyping import install_import_hook
 
-from tests import quick_compilation
+from tests import quick_compilation, type_checks
 from tests.long_examples import LONG_EXAMPLES
 
 # With XLA_FLAGS set, if only to an empty text, tests run the code that users run.
@@ -18,11 +18,8 @@ quick_compilation.set_flags()
 
 jax.config.update("jax_numpy_rank_promotion", "raise")
 
-# beartype refuses an int for a float unless told of the numeric tower of PEP 484.
-CHECKER = "beartype.beartype(conf=beartype.BeartypeConf(is_pep484_tower=True))"
-
 # Called a million times by the tests of trees alone, and they raise errors of their own.
-UNHOOKED = {"jaxlidar._checks", "jaxlidar._signatures"}
+UNHOOKED = {"jaxlidar._checks"}
 
 
 def hooked_modules():
@@ -38,7 +35,7 @@ def pytest_configure(config):
     """Import the packages with their checks, except in a process that only hands out tests to workers."""
     if config.getoption("numprocesses", None) and not hasattr(config, "workerinput"):
         return
-    with install_import_hook(hooked_modules(), CHECKER):
+    with install_import_hook(hooked_modules(), f"{type_checks.__name__}.check_types"):
         import jaxlidar  # noqa: F401
 
         # Before `inversion` is imported, as in processes that tests start: options are read there by then.

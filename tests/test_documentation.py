@@ -4,9 +4,7 @@ The examples themselves are doctests, which pytest collects from the packages.
 """
 
 import ast
-import contextlib
 import inspect
-import pickle
 import re
 import textwrap
 
@@ -81,42 +79,6 @@ def test_a_function_says_what_it_returns(name):
     arguments = inspect.signature(FUNCTIONS[name]).parameters
     for argument in arguments:
         assert f"`{argument}`" in text, f"says what {argument} is"
-
-
-def signatures_shown():
-    """Signatures of all public functions, classes and public methods, by name, as `help` shows them."""
-    for name, exported in CALLABLE.items():
-        members = dir(exported) if inspect.isclass(exported) else ()
-        methods = {m: getattr(exported, m) for m in members if not m.startswith("_")}
-        routines = {f"{name}.{m}": value for m, value in methods.items() if callable(value)}
-        for label, function in {name: exported, **routines}.items():
-            # Warnings are built-in classes without a signature.
-            with contextlib.suppress(ValueError):
-                yield label, inspect.signature(function)
-
-
-def test_signatures_fit_on_a_screen():
-    shown = dict(signatures_shown())
-    assert len(shown) > 300
-    for name, signature in shown.items():
-        assert len(str(signature)) <= 600, name
-        annotations = [signature.return_annotation, *(p.annotation for p in signature.parameters.values())]
-        for annotation in annotations:
-            assert len(inspect.formatannotation(annotation)) <= 60, (name, annotation)
-
-
-def test_signatures_name_types_as_source_code_does():
-    text = str(inspect.signature(inversion.ground_and_canopy))
-    assert text.startswith(
-        '(height: Float[ArrayLike, "... bins"], power: Float[ArrayLike, "... bins"], *, pulse: '
-    )
-    assert text.endswith("-> GroundAndCanopy")
-    assert "(lidar: Lidar, scene: Scene, *, key: PRNGKeyArray, rtol: float | None = None" in str(
-        inspect.signature(jaxlidar.simulate)
-    )
-    # Only what is shown is short: readers of annotations find the types.
-    assert inspect.get_annotations(jaxlidar.simulate)["scene"] is jaxlidar.Scene
-    assert pickle.loads(pickle.dumps(jaxlidar.simulate)) is jaxlidar.simulate
 
 
 @pytest.mark.parametrize("package", [jaxlidar, inversion])

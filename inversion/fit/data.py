@@ -155,7 +155,7 @@ def as_observed(
     elif time is None:
         raise ValueError("time = None, but observed is an array: its sample times are needed")
     t = as_sample_times(time, lidar)
-    y = as_numpy(observed, "observed", missing=True)
+    y = as_numpy(observed, "observed")
     # The axis of a single wavelength may be left out.
     if y.ndim == 1:
         y = y[None, :]

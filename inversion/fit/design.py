@@ -31,7 +31,6 @@ logarithm of the cost, from several starts.
 
 import dataclasses
 import math
-import warnings
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple, final
 
@@ -59,7 +58,15 @@ from inversion.fit.unknowns import (
     split_values,
 )
 from jaxlidar import Lidar, Plan, Response, Scene
-from jaxlidar.extend import as_numpy, check_integer, check_key, check_kind, check_kinds, check_range
+from jaxlidar.extend import (
+    as_numpy,
+    check_integer,
+    check_key,
+    check_kind,
+    check_kinds,
+    check_range,
+    warn_user,
+)
 from jaxlidar.planning.effects import effects_of_family
 from jaxlidar.planning.scene_family import check_scenes, plan_cases
 
@@ -339,12 +346,10 @@ class _DesignProblem(eqx.Module):
             if error < tolerance:
                 return traced_scenes
             if nodes.count >= _MAX_NODES:
-                warnings.warn(
+                warn_user(
                     f"the cost between the {nodes.count} divergences that were traced is known to "
                     f"{error:.1%} only: the divergence found may not be the best; narrower limits, or more "
-                    "rays or photons, help",
-                    # One more than the calls: Equinox puts a call of its own around methods.
-                    stacklevel=4,
+                    "rays or photons, help"
                 )
                 return traced_scenes
 

@@ -10,7 +10,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxlidar.extend import Converted, as_array, as_scalar, check_integer, check_range
+from jaxlidar.extend import as_array, as_scalar, check_integer, check_range
 
 
 @final
@@ -35,8 +35,8 @@ class LogNormal(eqx.Module):
     0.3
     """
 
-    median: Converted[Float[Array, "..."]] = eqx.field(converter=lambda x: as_array(x, "median"))
-    spread: Converted[Float[Array, "..."]] = eqx.field(converter=lambda x: as_array(x, "spread"))
+    median: Float[Array, "..."] = eqx.field(converter=lambda x: as_array(x, "median"))
+    spread: Float[Array, "..."] = eqx.field(converter=lambda x: as_array(x, "spread"))
 
     def __check_init__(self):
         check_range("median", self.median, 0.0, low_open=True)
@@ -88,14 +88,14 @@ class Smooth(eqx.Module):
     [1.   0.78 0.48]
     """
 
-    scale: Converted[Float[Array, ""]] = eqx.field(converter=lambda x: as_scalar(x, "scale"))
-    spacing: Converted[Float[Array, ""]] = eqx.field(
+    scale: Float[Array, ""] = eqx.field(converter=lambda x: as_scalar(x, "scale"))
+    spacing: Float[Array, ""] = eqx.field(
         converter=lambda x: as_scalar(x, "spacing"), default=1.0, kw_only=True
     )
-    strength: Converted[Float[Array, ""] | None] = eqx.field(
+    strength: Float[Array, ""] | None = eqx.field(
         converter=lambda x: None if x is None else as_scalar(x, "strength"), default=None, kw_only=True
     )
-    mean: Converted[Float[Array, "..."] | None] = eqx.field(
+    mean: Float[Array, "..."] | None = eqx.field(
         converter=lambda x: None if x is None else as_array(x, "mean"), default=None, kw_only=True
     )
 
@@ -157,8 +157,8 @@ class MarkovField(eqx.Module):
     [0.1 0.1 0.3]
     """
 
-    difference: Converted[Float[Array, "..."]] = eqx.field(converter=lambda x: as_array(x, "difference"))
-    mean: Converted[Float[Array, ""] | None] = eqx.field(
+    difference: Float[Array, "..."] = eqx.field(converter=lambda x: as_array(x, "difference"))
+    mean: Float[Array, ""] | None = eqx.field(
         converter=lambda x: None if x is None else as_scalar(x, "mean"), default=None, kw_only=True
     )
 

@@ -16,7 +16,6 @@ fit of a footprint depends neither on `lanes` nor on the executor.
 import contextlib
 import dataclasses
 import os
-import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from typing import Any, NamedTuple
@@ -57,6 +56,7 @@ from jaxlidar.extend import (
     outcomes,
     side_by_side,
     task,
+    warn_user,
 )
 from jaxlidar.io.checkpoint import Checkpoint, open_checkpoint
 
@@ -165,7 +165,7 @@ def retrieve_many(
     >>> fits.values["brightness"].round(3).tolist()
     [0.2, 0.4]
     """
-    y = as_numpy(observed, "observed", missing=True)
+    y = as_numpy(observed, "observed")
     if y.ndim != 3 or len(y) == 0:
         raise ValueError(f"observed has the shape {y.shape}; admissible is (footprints, wavelengths, bins)")
     n_footprints, n_wavelengths, n_bins = y.shape
@@ -352,10 +352,9 @@ class FinishedFits:
         except OSError as error:
             if not self._has_warned:
                 self._has_warned = True
-                warnings.warn(
+                warn_user(
                     f"{error}. The fits go on, and are returned; every further one tries to write what is "
-                    "missing",
-                    stacklevel=3,
+                    "missing"
                 )
 
     def progress(self) -> RetrievalProgress:

@@ -20,7 +20,7 @@ from jaxtyping import Array, ArrayLike, Float
 
 from inversion.fit.priors import LogNormal, MarkovField, Smooth
 from jaxlidar import Lidar, Scene
-from jaxlidar.extend import Converted, as_array, check_kind, check_range
+from jaxlidar.extend import as_array, check_kind, check_range
 
 # (mean, standard deviation), or one of the named priors.
 Prior = tuple[Float[Array, "..."], Float[Array, "..."]] | LogNormal | Smooth | MarkovField
@@ -107,14 +107,10 @@ class Unknown(eqx.Module):
     """
 
     where: str | Callable[[Any], Any] | None = eqx.field(static=True, default=None)
-    bounds: Converted[tuple[Float[Array, "..."], Float[Array, "..."]]] = eqx.field(
-        converter=_as_bounds, kw_only=True
-    )
+    bounds: tuple[Float[Array, "..."], Float[Array, "..."]] = eqx.field(converter=_as_bounds, kw_only=True)
     name: str | None = eqx.field(static=True, default=None, kw_only=True)
-    prior: Converted[Prior | None] = eqx.field(converter=_as_optional_prior, default=None, kw_only=True)
-    start: Converted[Float[Array, "..."] | None] = eqx.field(
-        converter=_as_optional_start, default=None, kw_only=True
-    )
+    prior: Prior | None = eqx.field(converter=_as_optional_prior, default=None, kw_only=True)
+    start: Float[Array, "..."] | None = eqx.field(converter=_as_optional_start, default=None, kw_only=True)
     apply: Callable[[Scene, Array], Scene] | None = eqx.field(static=True, default=None, kw_only=True)
 
     def __check_init__(self):

@@ -6,7 +6,6 @@
 3. Standard errors include PROSPECT's own error, correlated over wavelengths (`errors.py`).
 """
 
-import warnings
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple, final
 
@@ -19,7 +18,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int
 from inversion.leaf.errors import LinearisedFit, inverse_root, trait_errors
 from inversion.leaf.solver import LeafFitState, LeafProblem, fit_leaves
 from jaxlidar import Prospect
-from jaxlidar.extend import as_numpy, check_integer, check_numbers, check_range
+from jaxlidar.extend import as_numpy, check_integer, check_numbers, check_range, warn_user
 from jaxlidar.optics.coefficients import TRAITS
 from jaxlidar.optics.leaf_surface import LeafSurface
 from jaxlidar.optics.prospect import material
@@ -206,7 +205,7 @@ def invert_leaves(
 
     - `wavelengths`: (wavelengths,) nm, in any order, within PROSPECT's 400 to 2500.
     - `reflectance`, `transmittance`: (leaves, wavelengths) fractions, or (wavelengths,) of one leaf; missing
-      samples are NaN or masked. One of the two may be None, but without transmittance the data hardly
+      samples are NaN. One of the two may be None, but without transmittance the data hardly
       separate N from the other traits.
     - `unknowns`: names out of "N" and the traits of the version. Default None: all of them.
     - `leaf`: a `Prospect` that gives the version, alpha and coefficients, the starting values of the unknowns
@@ -343,12 +342,11 @@ def invert_leaves(
         unflagged = np.flatnonzero((gap_light > _GAP_LIGHT) & ~is_needle)
         if unflagged.size:
             first = ", ".join(map(str, unflagged[:5])) + (", ..." if unflagged.size > 5 else "")
-            warnings.warn(
+            warn_user(
                 f"{unflagged.size} of {len(observed)} leaves ({first}) let more light through than leaves do "
                 "where they are opaque, as needles with gaps between them do: their Cw and Cm are biased. "
                 "needle=True for these leaves takes bands that gaps affect less",
                 GapLightWarning,
-                stacklevel=2,
             )
         calibration = jnp.asarray([_CALIBRATION.get(name, 0.0) for name in trait_names], dtype)
         errors = jnp.hypot(errors, calibration[None] * best)
@@ -394,9 +392,7 @@ def _check_spectra(
     if x.ndim != 1 or x.size == 0:
         raise ValueError(f"wavelengths has the shape {x.shape}; admissible is (wavelengths,), one or more")
     arguments = {"reflectance": reflectance, "transmittance": transmittance}
-    spectra = {
-        name: np.atleast_2d(as_numpy(s, name, missing=True)) for name, s in arguments.items() if s is not None
-    }
+    spectra = {name: np.atleast_2d(as_numpy(s, name)) for name, s in arguments.items() if s is not None}
     if not spectra:
         raise ValueError(
             "reflectance = None and transmittance = None; admissible is an array for one or both"

@@ -188,13 +188,13 @@ def compare(
     )
     pairs, statistics = {}, []
     for name, reference_name in names.items():
-        estimate = as_numpy(estimates[name], name, missing=True)
-        expected = np.append(as_numpy(references[reference_name], reference_name, missing=True), np.nan)
+        estimate = as_numpy(estimates[name], name)
+        expected = np.append(as_numpy(references[reference_name], reference_name), np.nan)
         # The row -1, of shots that the reference lacks, is the NaN at the end.
         expected = expected[rows]
         stderr = np.full(count, np.nan)
         if name + _STDERR in estimates:
-            stderr = as_numpy(estimates[name + _STDERR], name + _STDERR, missing=True)
+            stderr = as_numpy(estimates[name + _STDERR], name + _STDERR)
         both = np.isfinite(estimate) & np.isfinite(expected)
         pair = ComparedColumn(expected[both], estimate[both], stderr[both], group[both], units.get(name, ""))
         pairs[name] = pair

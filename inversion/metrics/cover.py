@@ -274,14 +274,12 @@ def plant_area_index(
     >>> print(f"{float(inversion.plant_area_index(0.5)):.2f}")
     1.39
     """
-    check_numbers("gap", gap, missing=True)
+    check_numbers("gap", gap)
     values = concrete(gap)
     if values is not None:
         check_range("gap", values[~np.isnan(values)], 0.0, 1.0)
     _check_canopy_structure(zenith, projection, clumping)
-    return (
-        -jnp.log(as_array(gap, "gap", missing=True)) * jnp.cos(jnp.deg2rad(zenith)) / (projection * clumping)
-    )
+    return -jnp.log(as_array(gap, "gap")) * jnp.cos(jnp.deg2rad(zenith)) / (projection * clumping)
 
 
 def _check_canopy_structure(zenith: Any, projection: Any, clumping: Any) -> None:

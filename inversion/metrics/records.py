@@ -119,7 +119,7 @@ class EvenAxis(NamedTuple):
         """Difference of values from the first one, rounded after it is taken; NaN for missing values."""
         values, first = concrete(x), concrete(self.first)
         if values is None or first is None:
-            return as_array(x, field, missing=True) - as_array(self.first)
+            return as_array(x, field) - as_array(self.first)
         return as_array(values - first)
 
     def absolute(self, x: Array) -> Array:

@@ -97,7 +97,7 @@ def amplitudes(
     if table is None:
         values, sigma = samples, np.full(samples.shape, float(noise))
     else:
-        amplitude_of_count = amplitude_table(as_numpy(table, "table", missing=True), decibels)
+        amplitude_of_count = amplitude_table(as_numpy(table, "table"), decibels)
         check_range("counts", samples, 0.0, amplitude_of_count.size - 1)
         saturation = amplitude_of_count.size - 1 if saturation is None else saturation
         table_counts = np.arange(amplitude_of_count.size)
@@ -192,7 +192,7 @@ def corrected_table(
     check_range("knots", knot_counts, 0.0)
     if knot_counts.ndim != 1 or knot_counts.size < 2 or not np.all(np.diff(knot_counts) > 0):
         raise ValueError(f"knots = {knots!r}; admissible are two or more that increase")
-    uncorrected = amplitude_table(as_numpy(table, "table", missing=True), decibels)
+    uncorrected = amplitude_table(as_numpy(table, "table"), decibels)
     counts = np.arange(uncorrected.size)
     pulses, echoes = ([as_numpy(r, n) for r in x] for n, x in (("pulses", pulses), ("echoes", echoes)))
     for name, records in (("pulses", pulses), ("echoes", echoes)):

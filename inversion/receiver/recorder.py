@@ -19,11 +19,9 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from jaxlidar.extend import (
-    Converted,
     as_array,
     as_numpy,
     as_scalar,
-    briefly,
     check_integer,
     check_number,
     check_range,
@@ -40,7 +38,6 @@ def _optional_impulse(x: Any) -> Array | None:
 
 
 @final
-@briefly
 class Recorder(eqx.Module):
     """Receiver and digitisers of a recorder, for `retrieve` and `retrieve_many`. Its gain is their `scale`.
 
@@ -85,15 +82,11 @@ class Recorder(eqx.Module):
 
     width: BoundPair | None = eqx.field(static=True, default=None)
     delay: BoundPair | None = eqx.field(static=True, default=None, kw_only=True)
-    impulse: Converted[Float[Array, " lags"] | None] = eqx.field(converter=_optional_impulse, default=None)
+    impulse: Float[Array, " lags"] | None = eqx.field(converter=_optional_impulse, default=None)
     offset: BoundPair | None = eqx.field(static=True, default=None)
     interleaved: int = eqx.field(static=True, default=1)
-    pulse_noise: Converted[Float[Array, ""]] = eqx.field(
-        converter=lambda x: as_scalar(x, "pulse_noise"), default=0.0
-    )
-    correlation: Converted[Float[Array, ""]] = eqx.field(
-        converter=lambda x: as_scalar(x, "correlation"), default=0.0
-    )
+    pulse_noise: Float[Array, ""] = eqx.field(converter=lambda x: as_scalar(x, "pulse_noise"), default=0.0)
+    correlation: Float[Array, ""] = eqx.field(converter=lambda x: as_scalar(x, "correlation"), default=0.0)
 
     def __check_init__(self):
         for field, low in (("width", 0.0), ("delay", -np.inf), ("offset", -np.inf)):

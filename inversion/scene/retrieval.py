@@ -304,7 +304,7 @@ def _observed_records(waveforms: Any, time: Any, noise: Any, survey: Survey) -> 
     elif time is None:
         raise ValueError("time = None, but waveforms is an array: its sample times are needed")
     times = as_sample_times(time, survey.lidar)
-    observed = as_numpy(waveforms, "waveforms", missing=True)
+    observed = as_numpy(waveforms, "waveforms")
     shape = (len(survey), survey.lidar.wavelength.size, times.size)
     if observed.shape != shape:
         raise ValueError(

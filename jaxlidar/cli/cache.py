@@ -1,10 +1,10 @@
 """Cache of compiled programs in the user's cache folder, for the next calls of the command."""
 
 import contextlib
-import warnings
 from collections.abc import Iterator
 
 from jaxlidar import _compilation_cache
+from jaxlidar._checks import warn_user
 
 
 @contextlib.contextmanager
@@ -16,7 +16,7 @@ def compilation_cache() -> Iterator[None]:
     try:
         cache = _compilation_cache.compilation_cache()
     except OSError as error:
-        warnings.warn(f"compiled programs are not kept: {error}", stacklevel=2)
+        warn_user(f"compiled programs are not kept: {error}")
         yield
         return
     with cache:

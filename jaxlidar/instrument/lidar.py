@@ -40,9 +40,7 @@ from jaxlidar._checks import (
     scalar,
     warn_units,
 )
-from jaxlidar._converted import Converted
 from jaxlidar._ranges import Range, check_ranges
-from jaxlidar._signatures import briefly
 from jaxlidar._text import object_text
 from jaxlidar.instrument.photon_counter import PhotonCounter
 from jaxlidar.instrument.pulse import AbstractPulse, GaussianPulse
@@ -100,7 +98,6 @@ def _slant_range(altitude: Float[Array, ""], zenith: Float[Array, ""]) -> Float[
 
 
 @final
-@briefly
 class Lidar(eqx.Module):
     """A full-waveform lidar: its position and pointing, beam, pulse and receiver.
 
@@ -164,22 +161,22 @@ class Lidar(eqx.Module):
     ['0.250', '0.433', '0.866']
     """
 
-    wavelength: Converted[Float[Array, " wavelengths"]] = eqx.field(converter=_wavelengths)
+    wavelength: Float[Array, " wavelengths"] = eqx.field(converter=_wavelengths)
     # None where the sensor is given by its position.
-    altitude: Converted[Float[Array, ""] | None] = eqx.field(converter=optional_scalar("altitude"))
+    altitude: Float[Array, ""] | None = eqx.field(converter=optional_scalar("altitude"))
     pulse: AbstractPulse
-    divergence: Converted[Float[Array, ""]] = eqx.field(converter=scalar("divergence"))
-    aperture: Converted[Float[Array, ""]] = eqx.field(converter=scalar("aperture"))
-    zenith: Converted[Float[Array, ""]] = eqx.field(converter=scalar("zenith"))
-    azimuth: Converted[Float[Array, ""]] = eqx.field(converter=scalar("azimuth"))
-    energy: Converted[Float[Array, "..."]] = eqx.field(converter=array("energy"))
-    sampling_interval: Converted[Float[Array, ""]] = eqx.field(converter=scalar("sampling_interval"))
+    divergence: Float[Array, ""] = eqx.field(converter=scalar("divergence"))
+    aperture: Float[Array, ""] = eqx.field(converter=scalar("aperture"))
+    zenith: Float[Array, ""] = eqx.field(converter=scalar("zenith"))
+    azimuth: Float[Array, ""] = eqx.field(converter=scalar("azimuth"))
+    energy: Float[Array, "..."] = eqx.field(converter=array("energy"))
+    sampling_interval: Float[Array, ""] = eqx.field(converter=scalar("sampling_interval"))
     profile: str = eqx.field(static=True)
     # (x, y) of the aim point, or (x, y, z) of the sensor.
-    position: Converted[Float[Array | np.ndarray, " axes"]] = eqx.field(converter=_position)
-    field_of_view: Converted[Float[Array, ""] | None] = eqx.field(converter=optional_scalar("field_of_view"))
-    jitter: Converted[Float[Array, ""]] = eqx.field(converter=scalar("jitter"))
-    efficiency: Converted[Float[Array, "..."]] = eqx.field(converter=array("efficiency"))
+    position: Float[Array | np.ndarray, " axes"] = eqx.field(converter=_position)
+    field_of_view: Float[Array, ""] | None = eqx.field(converter=optional_scalar("field_of_view"))
+    jitter: Float[Array, ""] = eqx.field(converter=scalar("jitter"))
+    efficiency: Float[Array, "..."] = eqx.field(converter=array("efficiency"))
     receiver: Receiver | PhotonCounter
     scan: AbstractScan | None = eqx.field(static=True)
 

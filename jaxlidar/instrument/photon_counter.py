@@ -46,10 +46,8 @@ from jaxlidar._checks import (
     scalar,
 )
 from jaxlidar._constants import PLANCK_TIMES_LIGHT, SPEED_OF_LIGHT
-from jaxlidar._converted import Converted
 from jaxlidar._ranges import FRACTION, Range, check_ranges
 from jaxlidar._registry import save_result
-from jaxlidar._signatures import briefly
 
 # More events would exceed the memory; more arrivals could not be counted exactly in double precision.
 _MAX_EVENTS = 1e8
@@ -67,7 +65,6 @@ def _window(x: Any) -> Float[Array, "..."] | None:
 
 
 @final
-@briefly
 class PhotonCounter(eqx.Module):
     """A receiver that counts photons. The default has the 16 pixels and the dead time of ATLAS' strong beams
     (ICESat-2; its weak beams have 4 pixels), detects all photons, and has no background and no jitter.
@@ -100,15 +97,13 @@ class PhotonCounter(eqx.Module):
     """
 
     pixels: int = eqx.field(static=True, default=16)
-    dead_time: Converted[Float[Array, ""]] = eqx.field(converter=scalar("dead_time"), default=3.2)
-    detection_probability: Converted[Float[Array, "..."]] = eqx.field(
+    dead_time: Float[Array, ""] = eqx.field(converter=scalar("dead_time"), default=3.2)
+    detection_probability: Float[Array, "..."] = eqx.field(
         converter=array("detection_probability"), default=1.0
     )
-    background_rate: Converted[Float[Array, "..."]] = eqx.field(
-        converter=array("background_rate"), default=0.0
-    )
-    jitter: Converted[Float[Array, ""]] = eqx.field(converter=scalar("jitter"), default=0.0)
-    window: Converted[Float[Array, "..."] | None] = eqx.field(converter=_window, default=None)
+    background_rate: Float[Array, "..."] = eqx.field(converter=array("background_rate"), default=0.0)
+    jitter: Float[Array, ""] = eqx.field(converter=scalar("jitter"), default=0.0)
+    window: Float[Array, "..."] | None = eqx.field(converter=_window, default=None)
 
     ranges: ClassVar = {
         "dead_time": Range(0.0),
@@ -132,7 +127,6 @@ class PhotonCounter(eqx.Module):
 
 
 @final
-@briefly
 class PhotonEvents(eqx.Module):
     """Events of a photon counter, in the order of shots, pulses and times. `len(events)` is their number.
 

@@ -39,9 +39,7 @@ from jax.scipy.special import erfc
 from jaxtyping import Array, ArrayLike, Float
 
 from jaxlidar._checks import as_array, as_scalar, check_range, concrete, scalar, warn_units
-from jaxlidar._converted import Converted
 from jaxlidar._ranges import Range, check_ranges
-from jaxlidar._signatures import briefly
 
 _FWHM_PER_SIGMA = 2 * math.sqrt(2 * math.log(2))
 # Extents of `support` in standard deviations and in mean lives. A normal variable lies outside +-5.5 sigma
@@ -135,7 +133,6 @@ class AbstractPulse(eqx.Module):
 
 
 @final
-@briefly
 class GaussianPulse(AbstractPulse):
     """A Gaussian pulse, centred on time zero.
 
@@ -154,7 +151,7 @@ class GaussianPulse(AbstractPulse):
     0.500
     """
 
-    fwhm: Converted[Float[Array, ""]] = eqx.field(converter=scalar("fwhm"), default=6.0)
+    fwhm: Float[Array, ""] = eqx.field(converter=scalar("fwhm"), default=6.0)
 
     ranges: ClassVar = {"fwhm": Range(0.0)}
 
@@ -183,7 +180,6 @@ class GaussianPulse(AbstractPulse):
 
 
 @final
-@briefly
 class RectangularPulse(AbstractPulse):
     """A pulse of constant power, centred on time zero.
 
@@ -202,7 +198,7 @@ class RectangularPulse(AbstractPulse):
     1.732 ns, 0.75 of the energy by 1.5 ns
     """
 
-    length: Converted[Float[Array, ""]] = eqx.field(converter=scalar("length"), default=6.0)
+    length: Float[Array, ""] = eqx.field(converter=scalar("length"), default=6.0)
 
     ranges: ClassVar = {"length": Range(0.0)}
 
@@ -231,7 +227,6 @@ class RectangularPulse(AbstractPulse):
 
 
 @final
-@briefly
 class ExponentiallyModifiedGaussianPulse(AbstractPulse):
     """A Gaussian convolved with a decaying exponential: a pulse with a sharp rise and a long tail.
 
@@ -254,8 +249,8 @@ class ExponentiallyModifiedGaussianPulse(AbstractPulse):
     0.570 of the energy, standard deviation 2.371 ns
     """
 
-    fwhm: Converted[Float[Array, ""]] = eqx.field(converter=scalar("fwhm"))
-    decay: Converted[Float[Array, ""]] = eqx.field(converter=scalar("decay"))
+    fwhm: Float[Array, ""] = eqx.field(converter=scalar("fwhm"))
+    decay: Float[Array, ""] = eqx.field(converter=scalar("decay"))
 
     ranges: ClassVar = {"fwhm": Range(0.0), "decay": Range(0.0)}
 
@@ -287,7 +282,6 @@ class ExponentiallyModifiedGaussianPulse(AbstractPulse):
 
 
 @final
-@briefly
 class SampledPulse(AbstractPulse):
     """A recorded transmit waveform: linear between its samples, zero outside, scaled to unit area.
 

@@ -41,11 +41,9 @@ from jaxlidar._checks import (
     warn_unit,
 )
 from jaxlidar._constants import PLANCK_TIMES_LIGHT
-from jaxlidar._converted import Converted
 from jaxlidar._not_kept import check_kept
 from jaxlidar._products import einsum
 from jaxlidar._ranges import Range, check_ranges
-from jaxlidar._signatures import briefly
 from jaxlidar.instrument.photon_counter import (
     MAX_NEGATIVE_FRACTION,
     PhotonCounter,
@@ -65,7 +63,6 @@ NoiseModel: TypeAlias = Callable[[Array, Array, Array], Any]
 
 
 @final
-@briefly
 class Receiver(eqx.Module):
     """Detection, noise and digitisation of a waveform. The default is a perfect record.
 
@@ -98,18 +95,12 @@ class Receiver(eqx.Module):
     ['0.0e+00', '1.0e-15', '3.0e-15']
     """
 
-    detection_threshold: Converted[Float[Array, ""]] = eqx.field(
-        converter=scalar("detection_threshold"), default=0.0
-    )
-    saturation: Converted[Float[Array, ""] | None] = eqx.field(
-        converter=optional_scalar("saturation"), default=None
-    )
+    detection_threshold: Float[Array, ""] = eqx.field(converter=scalar("detection_threshold"), default=0.0)
+    saturation: Float[Array, ""] | None = eqx.field(converter=optional_scalar("saturation"), default=None)
     bits: int | None = eqx.field(static=True, default=None)
-    background: Converted[Float[Array, ""]] = eqx.field(converter=scalar("background"), default=0.0)
+    background: Float[Array, ""] = eqx.field(converter=scalar("background"), default=0.0)
     photon_noise: bool = eqx.field(static=True, default=True)
-    electronic_noise: Converted[Float[Array, ""]] = eqx.field(
-        converter=scalar("electronic_noise"), default=0.0
-    )
+    electronic_noise: Float[Array, ""] = eqx.field(converter=scalar("electronic_noise"), default=0.0)
     window: str = eqx.field(static=True, default="fixed")
 
     ranges: ClassVar = {

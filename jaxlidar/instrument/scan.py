@@ -19,8 +19,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
-from jaxlidar._checks import as_numpy, check_choice, check_number, concrete, is_masked
-from jaxlidar._converted import Converted
+from jaxlidar._checks import as_numpy, check_choice, check_number, concrete
 
 # Largest angle between a beam and the vertical, degrees.
 MAX_ZENITH = 89.0
@@ -29,7 +28,7 @@ MAX_ZENITH = 89.0
 def _as_float(x: Any) -> Any:
     """Convert one number to a Python float (double precision); other objects are left to the checks."""
     number = concrete(x)
-    return x if number is None or number.ndim or is_masked(x) else float(number)
+    return x if number is None or number.ndim else float(number)
 
 
 class AbstractScan(eqx.Module):
@@ -82,8 +81,8 @@ class Oscillating(AbstractScan):
     [[0.0, 0.0, 1.0], [0.0, 0.5, 0.866], [0.0, -0.5, 0.866]]
     """
 
-    half_angle: Converted[float] = eqx.field(converter=_as_float)
-    frequency: Converted[float] = eqx.field(converter=_as_float)
+    half_angle: float = eqx.field(converter=_as_float)
+    frequency: float = eqx.field(converter=_as_float)
     motion: str = eqx.field(static=True, default="sine")
 
     def __check_init__(self):
@@ -121,8 +120,8 @@ class RotatingPolygon(AbstractScan):
     [[0.0, -0.5, 0.866], [0.0, 0.0, 1.0]]
     """
 
-    half_angle: Converted[float] = eqx.field(converter=_as_float)
-    line_rate: Converted[float] = eqx.field(converter=_as_float)
+    half_angle: float = eqx.field(converter=_as_float)
+    line_rate: float = eqx.field(converter=_as_float)
 
     def __check_init__(self):
         _check_pattern(self.half_angle, "line_rate", self.line_rate)
@@ -154,8 +153,8 @@ class Conical(AbstractScan):
     [[0.5, 0.0, 0.866], [0.0, 0.5, 0.866]]
     """
 
-    half_angle: Converted[float] = eqx.field(converter=_as_float)
-    frequency: Converted[float] = eqx.field(converter=_as_float)
+    half_angle: float = eqx.field(converter=_as_float)
+    frequency: float = eqx.field(converter=_as_float)
 
     def __check_init__(self):
         _check_pattern(self.half_angle, "frequency", self.frequency)

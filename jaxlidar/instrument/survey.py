@@ -31,7 +31,6 @@ from jaxlidar._checks import (
     concrete_number,
 )
 from jaxlidar._memory import format_bytes, machine_memory
-from jaxlidar._signatures import briefly
 from jaxlidar._text import number_text
 from jaxlidar.instrument.lidar import AIM_DISTANCE, STRAIGHT_UP, Lidar
 from jaxlidar.instrument.scan import MAX_ZENITH, AbstractScan
@@ -49,7 +48,6 @@ _LARGEST_COUNT = 1e30
 
 
 @final
-@briefly
 class Survey(eqx.Module):
     """Many shots of one lidar: the place and direction of each.
 

@@ -26,7 +26,6 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxlidar._checks import as_numpy, check_range
-from jaxlidar._signatures import briefly
 from jaxlidar._text import number_text
 
 # Courses of two positions that are nearer to one another than this, m, are not defined.
@@ -34,7 +33,6 @@ _LEAST_STEP = 1e-6
 
 
 @final
-@briefly
 class Trajectory(eqx.Module):
     """Position and attitude of a platform over time: an aircraft, a drone, a vehicle, a tripod.
 

@@ -1,7 +1,6 @@
 """Files: recorded waveforms, voxel maps, points, tree models, meshes and terrain; cases and results."""
 
 from jaxlidar._files import atomic_write
-from jaxlidar._signatures import shorten_signatures
 from jaxlidar.io.airborne import (
     AirborneShot,
     AirborneShots,
@@ -84,5 +83,3 @@ __all__ = [
     "write_las_waveforms",
     "write_raster",
 ]
-
-shorten_signatures(globals())

@@ -25,13 +25,14 @@ import os
 import sqlite3
 import stat
 import threading
-import warnings
 import zipfile
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
+
+from jaxlidar._checks import warn_user
 
 # Marks a checkpoint in SQLite's header (https://www.sqlite.org/fileformat2.html#application_id): "jlcp" in
 # ASCII.
@@ -117,9 +118,8 @@ class Checkpoint:
                 continue
             yield number, entry
         if damaged:
-            warnings.warn(
-                f"path = {self.path} is damaged, and these entries are computed again: {'; '.join(damaged)}",
-                stacklevel=3,
+            warn_user(
+                f"path = {self.path} is damaged, and these entries are computed again: {'; '.join(damaged)}"
             )
 
     def remove(self) -> None:

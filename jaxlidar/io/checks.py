@@ -2,7 +2,6 @@
 
 import contextlib
 import os
-import warnings
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
@@ -53,11 +52,6 @@ class FileWarning(UserWarning, ValueError):
     ...         print(str(error).partition("line ")[2])
     3: parent 2 is not in the file: 1 cylinder without a parent became a root
     """
-
-
-def warn_of_file(message: str, stacklevel: int = 3) -> None:
-    """Give a `FileWarning`; by default, at the line that called the function that calls this one."""
-    warnings.warn(message, FileWarning, stacklevel=stacklevel)
 
 
 @contextlib.contextmanager

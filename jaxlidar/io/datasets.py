@@ -40,7 +40,7 @@ from jaxlidar.io.case import Case, case_of, case_text
 from jaxlidar.io.checks import refuse_damage
 from jaxlidar.io.kinds import admits_tuple
 from jaxlidar.io.rows import CHECKSUMS, RowVariables, check_rows, unwritten_rows
-from jaxlidar.io.stores import FORMAT, Store
+from jaxlidar.io.stores import Store
 from jaxlidar.io.toml import nearest
 from jaxlidar.scenes.scene import Scene
 
@@ -61,9 +61,7 @@ class ResultLayout(NamedTuple):
     dimensions: Mapping[str, str]
     items: Mapping[str, str]
     coordinates: Mapping[str, str]
-    former_names: Mapping[str, str]
     rows: str | None
-    added: Collection[str]
 
     @property
     def row_variables(self) -> RowVariables:
@@ -93,9 +91,7 @@ def keep_as_netcdf(
     dimensions: Mapping[str, str] | None = None,
     items: Mapping[str, str] | None = None,
     coordinates: Mapping[str, str] | None = None,
-    former_names: Mapping[str, str] | None = None,
     rows: str | None = None,
-    added: Collection[str] = (),
 ) -> None:
     """Let `save` and `open` know a class of results, an `equinox.Module` whose fields are annotated.
 
@@ -112,12 +108,8 @@ def keep_as_netcdf(
     - `items`: names of the dimensions of the keys of dicts, by field. Default None: "FIELD_item".
     - `coordinates`: further fields that are coordinates, each with the dimension that it lies along. Default
       None: none.
-    - `former_names`: names of fields in files that were written before the fields were renamed, by their
-      names now. Default None: none was renamed.
     - `rows`: a dimension of the annotations that is the first of some fields. Their values are written and
       checked some rows at a time, and not read into memory. Default None: none.
-    - `added`: fields that files of earlier versions do not have, which are None where a file lacks them.
-      Default: none.
 
     **Returns:** nothing.
 
@@ -141,9 +133,7 @@ def keep_as_netcdf(
         dimensions or {},
         items or {},
         coordinates or {},
-        former_names or {},
         rows,
-        added,
     )
 
 
@@ -318,10 +308,10 @@ def _json_value(value: Any) -> Any:
     raise TypeError(f"a {type(value).__name__} is nothing that a file can hold")
 
 
-def _text_digest(dataset: Any, layout: ResultLayout, *, with_names: bool = True) -> str:
+def _text_digest(dataset: Any, layout: ResultLayout) -> str:
     """Checksum of the texts of a Dataset: netCDF has checksums for numbers alone.
 
-    The texts are the static fields, the keys in attributes, and, if `with_names`, the coordinates of texts.
+    The texts are the static fields, the keys in attributes, and the coordinates of texts.
     """
     variables = sorted(dataset.variables.items())
     items = [(name, variable.attrs["item"]) for name, variable in variables if "item" in variable.attrs]
@@ -332,7 +322,7 @@ def _text_digest(dataset: Any, layout: ResultLayout, *, with_names: bool = True)
     ]
     static = [field.name for field in dataclasses.fields(layout.kind) if field.metadata.get("static")]
     attributes = [(name, str(dataset.attrs[name])) for name in static if name in dataset.attrs]
-    texts = [items, names if with_names else [], attributes]
+    texts = [items, names, attributes]
     return hashlib.sha256(json.dumps(texts).encode()).hexdigest()
 
 
@@ -371,11 +361,7 @@ class _GroupReader:
         layout = layout_of(self._attribute(KIND), self.path)
         place = f"{self.path}: {self.group}"
         with refuse_damage(f"{place}: damaged"):
-            digests = {_text_digest(self.dataset, layout)}
-            if self.stored.dataset("/").attrs.get(FORMAT) == 1:
-                # The checksum in netCDF files of the first format does not include names.
-                digests.add(_text_digest(self.dataset, layout, with_names=False))
-            is_intact = self.dataset.attrs.get(_TEXT_DIGEST) in digests
+            is_intact = self.dataset.attrs.get(_TEXT_DIGEST) == _text_digest(self.dataset, layout)
         if not is_intact:
             raise ValueError(f"{place}: damaged (the checksum of its texts is another)")
         fields = {field.name: self._field(layout, field) for field in dataclasses.fields(layout.kind)}
@@ -391,9 +377,6 @@ class _GroupReader:
     def _field(self, layout: ResultLayout, field: Any) -> Any:
         name, annotation = field.name, field.type
         has_rows = name in layout.row_variables.names
-        keys_name, former_name = layout.items_of(name), layout.former_names.get(name, name)
-        if name not in self.dataset.variables and former_name in self.dataset.variables:
-            name = former_name
         if field.metadata.get("static"):
             return self._static(name, annotation)
         if (
@@ -407,7 +390,7 @@ class _GroupReader:
         if (item_annotation := _item_annotation(annotation)) is not None:
             if "..." in (_array_dimensions(item_annotation) or []):
                 return self._arrays_of_any_shape(name, item_annotation)
-            keys = self._texts(keys_name)
+            keys = self._texts(layout.items_of(name))
             arrays = self._array(name, item_annotation, has_rows)
             if len(arrays) != len(keys):
                 raise ValueError(f"{self._place(name)}: {len(arrays)} rows for {len(keys)} names")
@@ -415,8 +398,6 @@ class _GroupReader:
         if annotation in _CASE_FIELDS:
             return getattr(self.case(name), _CASE_FIELDS[annotation])
         if name in self.dataset.attrs and self._static(name, annotation) is None:
-            return None
-        if name in layout.added and self.stored.dataset(f"{self.group.rstrip('/')}/{name}") is None:
             return None
         return result_of(self.stored, f"{self.group.rstrip('/')}/{name}")
 

@@ -32,15 +32,15 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from jaxlidar._checks import check_numbers
+from jaxlidar._checks import check_numbers, warn_user
 from jaxlidar.io.checks import (
     MAX_COORDINATE,
     MAX_COUNTS,
     MAX_EXACT_INTEGER,
     TWO_WAY_METRES_PER_NS,
     TWO_WAY_TOLERANCE,
+    FileWarning,
     refuse_damage,
-    warn_of_file,
 )
 from jaxlidar.io.coordinates import check_elevations
 from jaxlidar.io.hdf5 import ProductFile, open_hdf5
@@ -209,7 +209,7 @@ def read_gedi_l1b(path: str | os.PathLike[str], shot: Any = None) -> list[GediSh
     if first_error is not None and (requested is not None or not complete):
         raise first_error.error
     for warning in remarks:
-        warn_of_file(warning)
+        warn_user(warning, FileWarning)
     return complete
 
 
@@ -230,7 +230,7 @@ def read_gedi_rows(path: str | os.PathLike[str]) -> list[GediShot | IncompleteSh
     """
     rows, remarks = _read_rows(path, None, counts_skipped=False)
     for warning in remarks:
-        warn_of_file(warning)
+        warn_user(warning, FileWarning)
     return rows
 
 

@@ -10,8 +10,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jaxlidar._checks import check_numbers
-from jaxlidar.io.checks import warn_of_file
+from jaxlidar._checks import check_numbers, warn_user
+from jaxlidar.io.checks import FileWarning
 from jaxlidar.io.hdf5 import ProductFile, open_hdf5
 from jaxlidar.io.tables import Column, ColumnAxis, ShotTable
 
@@ -187,7 +187,7 @@ def _read(
     if not beams:
         raise errors[0]
     for error in errors:
-        warn_of_file(f"{error}: the beam is skipped", stacklevel=4)
+        warn_user(f"{error}: the beam is skipped", FileWarning)
     # A column that one beam lacks would leave rows without a value: such columns are NaN there.
     names = [f.name for f in fields if any(f.name in beam for beam in beams)]
     columns = {name: _concatenate(beams, name) for name in ("shot_number", "beam", *names)}

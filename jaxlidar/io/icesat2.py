@@ -23,8 +23,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from jaxlidar._checks import check_choice, check_number, check_range, check_shape
-from jaxlidar.io.checks import MAX_COORDINATE, MAX_EXACT_INTEGER, warn_of_file
+from jaxlidar._checks import check_choice, check_number, check_range, check_shape, warn_user
+from jaxlidar.io.checks import MAX_COORDINATE, MAX_EXACT_INTEGER, FileWarning
 from jaxlidar.io.hdf5 import ProductFile, open_hdf5, text_of_attribute
 from jaxlidar.io.tables import Column, ShotTable
 
@@ -240,9 +240,10 @@ def read_atl03(
         is_complete = np.isin(segment, chosen) & has_place
         incomplete = int(np.sum(~has_place))
         if incomplete:
-            warn_of_file(
+            warn_user(
                 f"{file.location(f'{beam}/heights')}: {incomplete} of {height.size} photons have no height, "
-                "no distance or no time: they are left out"
+                "no distance or no time: they are left out",
+                FileWarning,
             )
         confidence = photons_of("signal_conf_ph", columns=len(SURFACES))[:, SURFACES.index(surface)]
         quality = (

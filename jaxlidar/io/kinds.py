@@ -12,7 +12,6 @@ import equinox as eqx
 import numpy as np
 
 from jaxlidar._checks import check_kind, concrete_array
-from jaxlidar._deprecated import RENAMED, warn_renamed
 from jaxlidar._registry import public_objects
 from jaxlidar.instrument.catalogue import instrument
 from jaxlidar.instrument.lidar import Lidar
@@ -196,14 +195,6 @@ def kinds() -> Mapping[str, Callable[..., Any]]:
         and name not in _NO_KINDS
     }
     return {**classes, **{function.__qualname__: function for function in _FUNCTIONS}}
-
-
-def current_kind(name: str) -> str:
-    """Return the present name of a kind; where `name` is one from before a renaming, warn."""
-    if name in kinds() or RENAMED.get(name) not in kinds():
-        return name
-    warn_renamed(f"kind = {name!r}", f"kind = {RENAMED[name]!r}")
-    return RENAMED[name]
 
 
 @functools.cache

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import ArrayLike, Num
 
-from jaxlidar._checks import as_numpy, check_number, check_range, check_shape, check_unmasked
+from jaxlidar._checks import as_numpy, check_number, check_range, check_shape
 from jaxlidar._files import atomic_write
 from jaxlidar.io.checks import MAX_COORDINATE, existing_file
 from jaxlidar.io.coordinates import WKT_RECORD, CoordinateSystem, check_elevations, metric_system
@@ -265,8 +265,6 @@ def las_points(
         raise ValueError("position holds no point; admissible is one or more")
     check_shape("position", position, (len(position), 3))
     check_range("position", position, -MAX_COORDINATE, MAX_COORDINATE)
-    for name, values in fields.items():
-        check_unmasked(name, values)
     fields = {name: np.asarray(values) for name, values in fields.items()}
     is_format_6 = point_format >= _FORMAT_6
     if "scan_angle" in fields:

@@ -16,14 +16,15 @@ from typing import Any, final
 import numpy as np
 from jaxtyping import Float
 
+from jaxlidar._checks import warn_user
 from jaxlidar.io.airborne import AirborneShots, Segment, evenly_spaced
 from jaxlidar.io.checks import (
     MAX_COUNTS,
     MAX_EXACT_INTEGER,
     TWO_WAY_METRES_PER_NS,
     TWO_WAY_TOLERANCE,
+    FileWarning,
     refuse_damage,
-    warn_of_file,
 )
 from jaxlidar.io.coordinates import GEOGRAPHIC_3D, CoordinateUnits, check_elevations
 from jaxlidar.io.hdf5 import ProductFile, open_hdf5
@@ -168,10 +169,10 @@ class _LvisShots(AirborneShots):
         difference = np.abs(stated - zenith)
         difference = difference[np.isfinite(difference)]
         if difference.size and np.median(difference) > _ANGLE_TOLERANCE:
-            warn_of_file(
+            warn_user(
                 f"{self.path}: /INCIDENTANGLE: {np.median(difference):.2g} degrees from the lines of "
                 "samples in the median: the lines are used",
-                stacklevel=5,
+                FileWarning,
             )
 
     @functools.cached_property
@@ -189,10 +190,10 @@ class _LvisShots(AirborneShots):
         tolerance = _NOISE_SIGMAS * self.levels.noise_std + _NOISE_COUNTS
         # Written so that NaN counts as a difference.
         if not difference <= tolerance:
-            warn_of_file(
+            warn_user(
                 f"{self.path}: /SIGMEAN: {difference:.3g} counts from the first samples of returns in the "
                 "median: these are used",
-                stacklevel=6,
+                FileWarning,
             )
             return None
         return stated

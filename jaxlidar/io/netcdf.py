@@ -42,8 +42,7 @@ from jaxlidar.spectral.waveform import Waveform
 from jaxlidar.truth import Truth
 
 CONVENTIONS = "CF-1.11"
-# Number of the format of files. A reader refuses newer ones. Version 0.2.0 wrote format 1: a waveform's
-# `energy_budget` is its `ledger`, and the checksum of texts in netCDF files does not include names.
+# Number of the format of files. A reader refuses others: version 0.2 wrote format 1.
 FORMAT_NUMBER = 2
 # Reasons why a simulation stopped that depend on more than its arguments.
 _NOT_REPEATABLE = ("time spent", "interrupted")
@@ -217,9 +216,10 @@ def _open_file(path: str | os.PathLike[str]) -> Iterator[Store]:
         if KIND not in attributes:
             raise ValueError(f"{path}: no attribute {KIND}: jaxlidar.io.save did not write it")
         written = attributes.get(FORMAT)
-        if not isinstance(written, int | np.integer) or not 1 <= written <= FORMAT_NUMBER:
+        if written != FORMAT_NUMBER:
             raise ValueError(
-                f"{path}: {FORMAT} = {written} is outside [1, {FORMAT_NUMBER}]: a newer jaxlidar's?"
+                f"{path}: {FORMAT} = {written}; admissible is {FORMAT_NUMBER}: "
+                f"{attributes.get('source', 'another version of jaxlidar')} wrote the file"
             )
         yield file
 
@@ -349,7 +349,6 @@ keep_as_netcdf(
     dimensions={"samples": "time", "wavelengths": "wavelength"},
     items={"components": "component", "energy_budget": "fate", "energy_budget_stderr": "fate"},
     coordinates={"height": "time"},
-    former_names={"energy_budget": "ledger", "energy_budget_stderr": "ledger_stderr"},
 )
 
 keep_as_netcdf(

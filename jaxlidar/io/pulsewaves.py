@@ -30,8 +30,9 @@ from typing import Any, BinaryIO, NamedTuple, TypeVar, final
 import numpy as np
 from jaxtyping import Bool
 
+from jaxlidar._checks import warn_user
 from jaxlidar.io.airborne import AirborneShots, Scanner, Segment, evenly_spaced
-from jaxlidar.io.checks import MAX_COORDINATE, existing_file, warn_of_file
+from jaxlidar.io.checks import MAX_COORDINATE, FileWarning, existing_file
 from jaxlidar.io.coordinates import (
     GEOGRAPHIC_3D,
     CoordinateSystem,
@@ -205,10 +206,10 @@ class _PulseWavesShots(AirborneShots):
         if self.pulse_numbers.size == 0:
             raise ValueError(f"{path}: pulse 0: neither this pulse nor another has a returning segment")
         if self.dropped["without a return"]:
-            warn_of_file(
+            warn_user(
                 f"{path}: pulse {int(np.argmin(has_return))}: it has no returning segment: "
                 f"{self.dropped['without a return']} of {header.count} pulses skipped",
-                stacklevel=4,
+                FileWarning,
             )
         rows = self.pulse_numbers[evenly_spaced(len(self))]
         # Geocentric lines become geographic ones.

@@ -8,8 +8,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jaxlidar._checks import check_number
-from jaxlidar.io.checks import MAX_COORDINATE, column_index, warn_of_file
+from jaxlidar._checks import check_number, warn_user
+from jaxlidar.io.checks import MAX_COORDINATE, FileWarning, column_index
 from jaxlidar.io.coordinates import unit_length
 from jaxlidar.io.text import parse_integer, parse_number, read_lines, split_cells
 from jaxlidar.plants.tree import Tree
@@ -149,8 +149,9 @@ def read_qsm(path: str | os.PathLike[str], *, scale: float | None = None) -> Tre
         became = "cylinder without a parent became a root"
         if len(cut) > 1:
             became = "cylinders without a parent became roots"
-        warn_of_file(
-            f"{path}: line {cut[0].line}: parent {cut[0].parent} is not in the file: {len(cut)} {became}"
+        warn_user(
+            f"{path}: line {cut[0].line}: parent {cut[0].parent} is not in the file: {len(cut)} {became}",
+            FileWarning,
         )
     return TreeRead(tree, dropped)
 

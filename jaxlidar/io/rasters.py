@@ -37,7 +37,7 @@ def write_raster(
     **Arguments:**
 
     - `path`: the file to write, .tif or .tiff. Missing folders are created.
-    - `values`: (shots,) numbers by name, NaN or masked where there is none; each becomes a band of that name.
+    - `values`: (shots,) numbers by name, NaN where there is none; each becomes a band of that name.
     - `position`: (shots, 2) x and y of the shots in m, or (shots, 3), of which z is not used, such as
       `Waveforms.ground_position`, in any order. Without `spacing` they lie on a grid along x and y, as those
       of `Survey.grid` do.
@@ -80,7 +80,7 @@ def write_raster(
     )
     bands = np.full((len(values), *shape), np.nan)
     for band, (name, shot_values) in zip(bands, values.items()):
-        numbers = as_numpy(shot_values, f"values of {name!r}", missing=True)
+        numbers = as_numpy(shot_values, f"values of {name!r}")
         check_shape(f"values of {name!r}", numbers, (len(has_place),))
         check_range(f"values of {name!r}", np.where(np.isnan(numbers), 0.0, numbers))
         # Rows run from north to south.
@@ -112,7 +112,7 @@ def _cell_means(numbers: np.ndarray, cells: np.ndarray, shape: tuple[int, int]) 
 
 def _horizontal(position: ArrayLike | Sequence, *, missing: bool) -> np.ndarray:
     """Return x and y of shots; with `missing`, NaN for those without a place."""
-    xy = as_numpy(position, "position", missing=missing)
+    xy = as_numpy(position, "position")
     if xy.ndim != 2 or xy.shape[1] not in (2, 3) or len(xy) == 0:
         raise ValueError(f"position has the shape {xy.shape}; admissible is (shots, 2), one or more")
     xy = xy[:, :2]

@@ -327,8 +327,8 @@ def _checked_values(store: Store, group: str, name: str) -> np.ndarray:
     """Read the values of a variable. **Raises:** ValueError where its checksum is another."""
     variable = store.dataset(group).variables[name]
     values = variable.values
-    # The first format has no such checksums, and no file has them for texts.
-    if values.dtype.kind not in "OUT" and store.dataset("/").attrs.get(FORMAT) != 1:
+    # No file has checksums of texts.
+    if values.dtype.kind not in "OUT":
         checksum = variable.attrs[CHECKSUM]
         if checksum_of(values) != checksum:
             raise ValueError("its checksum is another")

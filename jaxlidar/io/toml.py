@@ -26,7 +26,6 @@ from jaxlidar.io.kinds import (
     argument_value,
     arguments_of,
     call_kind,
-    current_kind,
     default_kind,
     item_annotation,
     kinds,
@@ -152,8 +151,6 @@ def value_of(table: Any, argument: Argument, path: str, read_array: ArrayReader,
             }
         raise ValueError(f"{path}: kind is missing: which class it is, or which function makes it")
     name = table["kind"]
-    if isinstance(name, str):
-        name = current_kind(name)
     if not isinstance(name, str) or name not in kinds():
         raise ValueError(f"{path}.kind = {name!r} is no kind; {nearest(str(name), kinds())}")
     arguments = {key: entry for key, entry in table.items() if key != "kind"}
@@ -164,7 +161,6 @@ def _kind_without_arguments(name: str, path: str, read_array: ArrayReader, folde
     """Return the result of a kind whose name stands for a table without arguments; None for "none"."""
     if name == _NONE:
         return None
-    name = current_kind(name)
     if name not in kinds():
         raise ValueError(f"{path} = {name!r} is no kind; {nearest(name, kinds())}")
     return _call(kinds()[name], {}, path, read_array, folder)

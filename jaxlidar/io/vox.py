@@ -10,8 +10,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from jaxlidar._checks import check_choice, check_range
-from jaxlidar.io.checks import MAX_COORDINATE, column_index, max_unpacked_size, warn_of_file
+from jaxlidar._checks import check_choice, check_range, warn_user
+from jaxlidar.io.checks import MAX_COORDINATE, FileWarning, column_index, max_unpacked_size
 from jaxlidar.io.coordinates import metric_system, unit_length
 from jaxlidar.io.text import parse_integer, parse_number, read_lines, split_cells
 from jaxlidar.optics.leaf_angles import LeafAngles
@@ -283,10 +283,10 @@ def _read_grid(path: Path, header: dict[str, tuple[str, int]]) -> _VoxelGrid:
         if np.any(np.abs(resolution - edges) > _EDGE_TOLERANCE):
             # HELIOS++ writes the points' largest coordinates, rounded up, as max_corner.
             end = (np.array(low) + shape * resolution).tolist()
-            warn_of_file(
+            warn_user(
                 f"{path}: line {line}: voxels of res = {text} end at {end}, not at max_corner = {[*high]}: "
                 "res is used",
-                stacklevel=4,
+                FileWarning,
             )
             edges = resolution
     return _VoxelGrid(shape, edges, low)

@@ -35,14 +35,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxlidar._checks import briefly, scalar
-from jaxlidar._converted import Converted
-from jaxlidar._deprecated import RenamedMethods
+from jaxlidar._checks import scalar
 from jaxlidar._ranges import Range, check_ranges
 from jaxlidar._vectors import Scalar, Vec, about, cross, dot, from_frame, polar, vec
 
 
-class AbstractLaw(RenamedMethods, eqx.Module):
+class AbstractLaw(eqx.Module):
     """A law of reflection: how a surface distributes the light that it reflects over directions.
 
     A law of your own is one class in one file: derive it from this, give its five methods, and pass it as
@@ -160,7 +158,6 @@ class AbstractMirror(AbstractLaw):
 
 
 @final
-@briefly
 class Lambertian(AbstractLaw):
     """Lambertian reflection: equal radiance in all directions of the lit side (intensity by the cosine law).
 
@@ -192,7 +189,6 @@ class Lambertian(AbstractLaw):
 
 
 @final
-@briefly
 class EqualAngle(AbstractLaw):
     """Reflection with a polar angle uniform in [0, 90] degrees: the paper's "every angle equally likely".
 
@@ -236,7 +232,6 @@ def _square_of_sine(normal: Vec, out: Vec) -> Scalar:
 
 
 @final
-@briefly
 class Specular(AbstractMirror):
     """Specular reflection: a mirror of slightly tilted facets, with a Gaussian lobe about its direction.
 
@@ -262,7 +257,7 @@ class Specular(AbstractMirror):
     50.0
     """
 
-    roughness: Converted[Float[Array, ""]] = eqx.field(converter=scalar("roughness"), default=0.0)
+    roughness: Float[Array, ""] = eqx.field(converter=scalar("roughness"), default=0.0)
 
     ranges: ClassVar = {"roughness": Range(0.0, 0.5)}
 

@@ -8,13 +8,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from jaxlidar._checks import array, briefly
-from jaxlidar._converted import Converted
+from jaxlidar._checks import array
 from jaxlidar._ranges import FRACTION, SUM_OF_FRACTIONS, check_ranges
 
 
 @final
-@briefly
 class LeafOptics(eqx.Module):
     """Leaf optics from given reflectance and transmittance: `R, T = optics(wavelengths)`, as with `Prospect`.
 
@@ -36,10 +34,8 @@ class LeafOptics(eqx.Module):
     ['0.10', '0.45'] ['0.05', '0.40']
     """
 
-    reflectance: Converted[Float[Array, "*wavelengths"]] = eqx.field(converter=array("reflectance"))
-    transmittance: Converted[Float[Array, "*wavelengths"]] = eqx.field(
-        converter=array("transmittance"), default=0.0
-    )
+    reflectance: Float[Array, "*wavelengths"] = eqx.field(converter=array("reflectance"))
+    transmittance: Float[Array, "*wavelengths"] = eqx.field(converter=array("transmittance"), default=0.0)
 
     ranges: ClassVar = {
         "reflectance": FRACTION,

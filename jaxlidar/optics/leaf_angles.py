@@ -29,8 +29,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxlidar._checks import array, as_scalar, briefly, check_choice, check_range, concrete
-from jaxlidar._converted import Converted
+from jaxlidar._checks import array, as_scalar, check_choice, check_range, concrete
 from jaxlidar._products import matmul
 from jaxlidar._ranges import Range, check_ranges
 
@@ -40,7 +39,6 @@ ANGLE_NODES = 129
 
 
 @final
-@briefly
 class LeafAngles(eqx.Module):
     """A leaf angle distribution, uniform in azimuth, as probabilities of cells of one degree of inclination.
 
@@ -65,7 +63,7 @@ class LeafAngles(eqx.Module):
     0.849
     """
 
-    probability: Converted[Float[Array, "90"]] = eqx.field(converter=array("probability"))
+    probability: Float[Array, "90"] = eqx.field(converter=array("probability"))
 
     ranges: ClassVar = {"probability": Range(0.0)}
 

@@ -23,9 +23,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxlidar._checks import array, briefly, scalar
-from jaxlidar._converted import Converted
-from jaxlidar._deprecated import RenamedMethods
+from jaxlidar._checks import array, scalar
 from jaxlidar._ranges import FRACTION, Range, check_ranges
 from jaxlidar._vectors import Scalar, Vec, dot, from_frame, polar
 
@@ -33,7 +31,7 @@ from jaxlidar._vectors import Scalar, Vec, dot, from_frame, polar
 ISOTROPIC_INTENSITY_FACTOR = 0.25
 
 
-class AbstractPhase(RenamedMethods, eqx.Module):
+class AbstractPhase(eqx.Module):
     """A phase function with its single scattering albedo: how a volume scatters light.
 
     A phase function of your own is one class in one file: derive it from this, give its three methods
@@ -111,7 +109,6 @@ def _check_phase(phase: AbstractPhase) -> None:
 
 
 @final
-@briefly
 class Isotropic(AbstractPhase):
     """Isotropic volume scattering, the same in all directions: often assumed by discrete ordinates codes.
 
@@ -132,7 +129,7 @@ class Isotropic(AbstractPhase):
     ['0.1', '0.9']
     """
 
-    albedo: Converted[Float[Array, "..."]] = eqx.field(converter=array("albedo"))
+    albedo: Float[Array, "..."] = eqx.field(converter=array("albedo"))
 
     ranges: ClassVar = {"albedo": FRACTION}
 
@@ -150,7 +147,6 @@ class Isotropic(AbstractPhase):
 
 
 @final
-@briefly
 class HenyeyGreenstein(AbstractPhase):
     """Volume scattering by Henyey and Greenstein's phase function: a forward or a backward lobe.
 
@@ -177,8 +173,8 @@ class HenyeyGreenstein(AbstractPhase):
     1.500 forward, 0.056 back
     """
 
-    albedo: Converted[Float[Array, "..."]] = eqx.field(converter=array("albedo"))
-    g: Converted[Float[Array, ""]] = eqx.field(converter=scalar("g"), default=0.0)
+    albedo: Float[Array, "..."] = eqx.field(converter=array("albedo"))
+    g: Float[Array, ""] = eqx.field(converter=scalar("g"), default=0.0)
 
     ranges: ClassVar = {"albedo": FRACTION, "g": Range(-0.95, 0.95)}
 

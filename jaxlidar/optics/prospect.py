@@ -43,7 +43,6 @@ from jaxtyping import Array, ArrayLike, Float
 from jaxlidar._checks import (
     as_numpy,
     as_scalar,
-    briefly,
     check_choice,
     check_integer,
     check_kind,
@@ -77,7 +76,6 @@ _Batch = Float[Array, "leaves *wavelengths"]
 
 
 @final
-@briefly
 class Prospect(eqx.Module):
     """A leaf by the PROSPECT model: `R, T = leaf(wavelengths)` are its reflectance and transmittance.
 

@@ -32,7 +32,6 @@ from jaxtyping import Array, ArrayLike, Float
 from jaxlidar._checks import (
     array,
     as_array,
-    briefly,
     check_choice,
     check_kind,
     check_range,
@@ -40,7 +39,6 @@ from jaxlidar._checks import (
     scalar,
     warn_units,
 )
-from jaxlidar._converted import Converted
 from jaxlidar._ranges import FRACTION, SUM_OF_FRACTIONS, Range, check_ranges
 
 # The largest wavelength, nm, that is finite in single precision.
@@ -48,7 +46,6 @@ _LARGEST_SINGLE = float(np.finfo(np.float32).max)
 
 
 @final
-@briefly
 class Spectrum(eqx.Module):
     """A reflectance spectrum, linear between its samples: `spectrum(wavelength)` is the reflectance.
 
@@ -74,10 +71,10 @@ class Spectrum(eqx.Module):
     0.305
     """
 
-    wavelength: Converted[Float[Array, " samples"]] = eqx.field(converter=array("wavelength"))
-    reflectance: Converted[Float[Array, " samples"]] = eqx.field(converter=array("reflectance"))
+    wavelength: Float[Array, " samples"] = eqx.field(converter=array("wavelength"))
+    reflectance: Float[Array, " samples"] = eqx.field(converter=array("reflectance"))
     name: str = eqx.field(static=True, default="")
-    scale: Converted[Float[Array, ""]] = eqx.field(converter=scalar("scale"), default=1.0)
+    scale: Float[Array, ""] = eqx.field(converter=scalar("scale"), default=1.0)
 
     ranges: ClassVar = {
         "wavelength": Range(0.0, low_open=True, increasing=True),

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxlidar._checks import briefly, check_kind, is_traced
+from jaxlidar._checks import check_kind, is_traced
 from jaxlidar._ranges import inadmissible
 from jaxlidar.instrument.lidar import Lidar
 from jaxlidar.planning.effects import without_effects
@@ -19,7 +19,6 @@ from jaxlidar.scenes.terrain import Terrain
 
 
 @final
-@briefly
 class Setup(eqx.Module):
     """A lidar and a scene without the effects that a plan leaves out, and the plan.
 

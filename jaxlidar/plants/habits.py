@@ -26,7 +26,6 @@ from typing import Any, final
 import numpy as np
 
 from jaxlidar._checks import (
-    briefly,
     check_integer,
     check_kind,
     check_number,
@@ -100,7 +99,6 @@ class Branching:
 
 
 @final
-@briefly
 @dataclass(frozen=True)
 class Habit:
     """The growth habit of a tree: sizes and branching proportions from which `grow` makes individuals.

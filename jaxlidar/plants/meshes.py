@@ -21,14 +21,12 @@ import numpy as np
 from jaxtyping import ArrayLike, Bool, Float, Int
 
 from jaxlidar._checks import (
-    briefly,
     check_integer,
     check_kind,
     check_number,
     check_range,
     check_seed,
     check_shape,
-    check_unmasked,
     warn_user,
 )
 from jaxlidar._summary import percent
@@ -48,7 +46,6 @@ _SNAP_DISTANCE = 1e-9
 
 
 @final
-@briefly
 @dataclass(frozen=True, eq=False, init=False)
 class Mesh:
     """A mesh of n triangles over m vertices, each triangle of one of several materials.
@@ -88,8 +85,6 @@ class Mesh:
         materials: Sequence[str] = ("mesh",),
     ):
         check_range("vertices", vertices)
-        for name, indices in (("faces", faces), ("material", material)):
-            check_unmasked(name, indices)
         vertices, faces = np.asarray(vertices, float), np.asarray(faces)
         material = np.zeros(len(faces), int) if material is None else np.asarray(material)
         for name, indices in (("faces", faces), ("material", material)):

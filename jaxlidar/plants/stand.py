@@ -7,13 +7,12 @@ from typing import Any, final, overload
 import numpy as np
 from jaxtyping import Float, Int
 
-from jaxlidar._checks import briefly, check_kind, check_number, check_range, check_shape
+from jaxlidar._checks import check_kind, check_number, check_range, check_shape
 from jaxlidar.plants.tree import Tree
 from jaxlidar.scenes.terrain import Terrain
 
 
 @final
-@briefly
 @dataclass(frozen=True, eq=False)
 class Stand(Sequence[Tree]):
     """A stand: n trees that are copies of a few individuals. It is a sequence of `Tree`.

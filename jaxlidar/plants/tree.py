@@ -8,11 +8,10 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy import spatial
 
-from jaxlidar._checks import briefly, check_kind, check_number, check_range, check_shape
+from jaxlidar._checks import check_kind, check_number, check_range, check_shape
 
 
 @final
-@briefly
 @dataclass(frozen=True, eq=False)
 class Tree:
     """The geometry of a tree: n branch segments, each a cone frustum, and m spherical leaf clumps.

@@ -36,7 +36,6 @@ from jaxlidar._checks import (
     check_number,
     check_range,
     check_shape,
-    check_unmasked,
     kind_of,
 )
 from jaxlidar.plants.grid import Grid, voxel_edges
@@ -421,7 +420,6 @@ def voxelise_points(
     check_number("leaf_area", leaf_area, 0.0)
     check_number("wood_probability", wood_probability, 0.0, 1.0)
     min_points = check_integer("min_points", min_points)
-    check_unmasked("is_wood", is_wood)
     on_wood = np.zeros(len(points), bool) if is_wood is None else np.asarray(is_wood)
     # Numbers are refused: they may be classes, as in a LAS file, and nearly all would count as true.
     if on_wood.dtype != bool:

@@ -5,10 +5,6 @@ Every function draws on the given axes, or on those of a new figure, and returns
 saves the figure. The package, and matplotlib with it, is imported when it is first used.
 """
 
-from typing import Any
-
-from jaxlidar._deprecated import warn_renamed
-from jaxlidar._signatures import shorten_signatures
 from jaxlidar.plot.comparisons import comparison
 from jaxlidar.plot.fits import fit, residuals
 from jaxlidar.plot.light import accuracy, energy_budget
@@ -41,15 +37,6 @@ __all__ = [
     "waveform",
 ]
 
-shorten_signatures(globals())
-
 
 def __dir__() -> list[str]:
     return sorted(__all__)
-
-
-def __getattr__(name: str) -> Any:
-    if name == "ledger":
-        warn_renamed("jaxlidar.plot.ledger", "jaxlidar.plot.energy_budget")
-        return energy_budget
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

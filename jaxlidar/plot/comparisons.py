@@ -72,12 +72,8 @@ def _draw_pair(ax: Axes, name: str, pair: tuple, style: dict[str, Any]) -> None:
     """Draw one quantity."""
     if len(pair) < 2:
         raise ValueError(f"{name} has {len(pair)} arrays; admissible are reference and estimate at least")
-    reference, estimate = (as_numpy(values, f"{name} {i}", missing=True) for i, values in enumerate(pair[:2]))
-    stderr = (
-        as_numpy(pair[2], f"{name} stderr", missing=True)
-        if len(pair) > 2
-        else np.full(reference.shape, np.nan)
-    )
+    reference, estimate = (as_numpy(values, f"{name} {i}") for i, values in enumerate(pair[:2]))
+    stderr = as_numpy(pair[2], f"{name} stderr") if len(pair) > 2 else np.full(reference.shape, np.nan)
     group = np.asarray(pair[3]).astype(str) if len(pair) > 3 else np.full(reference.shape, "")
     unit = f" ({pair[4]})" if len(pair) > 4 and pair[4] else ""
     shapes = {array.shape for array in (reference, estimate, stderr, group)}

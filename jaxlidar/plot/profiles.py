@@ -165,7 +165,7 @@ def _layers(
     else:
         assert edges is not None
         layer_edges, density = edges, layers
-    values = as_numpy(density, f"{prefix}density", missing=True)
+    values = as_numpy(density, f"{prefix}density")
     if values.shape != (layer_edges.size - 1,):
         raise ValueError(
             f"{prefix}density has shape {values.shape}; admissible is {(layer_edges.size - 1,)}, one for "

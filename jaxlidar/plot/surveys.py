@@ -146,7 +146,7 @@ def _draw_relief(
 
 
 def _checked_values(values: Any, shots: int) -> Float[np.ndarray, " shots"]:
-    array = as_numpy(values, "values", missing=True)
+    array = as_numpy(values, "values")
     check_shape("values", array, (shots,))
     # NaN marks shots without a value.
     check_range("values", np.nan_to_num(array))

@@ -50,9 +50,7 @@ from jaxlidar._checks import (
     scalar,
     warn_units,
 )
-from jaxlidar._converted import Converted
 from jaxlidar._ranges import Range, check_ranges
-from jaxlidar._signatures import briefly
 from jaxlidar._text import object_text
 
 # Admissible wavelengths, nm. Peck and Reeder's formula is fitted to 230..1690 nm and smooth far beyond; the
@@ -167,7 +165,6 @@ def aerosol_extinction(
 
 
 @final
-@briefly
 class Atmosphere(eqx.Module):
     """A clear atmosphere: molecules and aerosol whose densities fall exponentially with height.
 
@@ -204,21 +201,17 @@ class Atmosphere(eqx.Module):
     0.788
     """
 
-    visibility: Converted[Float[Array, ""] | None] = eqx.field(
-        converter=optional_scalar("visibility"), default=23.0
-    )
+    visibility: Float[Array, ""] | None = eqx.field(converter=optional_scalar("visibility"), default=23.0)
     rayleigh: bool = eqx.field(static=True, default=True)
     aerosol_model: str = eqx.field(static=True, default="kim")
-    rayleigh_scale_height: Converted[Float[Array, ""]] = eqx.field(
+    rayleigh_scale_height: Float[Array, ""] = eqx.field(
         converter=scalar("rayleigh_scale_height"), default=8450.0
     )
-    aerosol_scale_height: Converted[Float[Array, ""]] = eqx.field(
+    aerosol_scale_height: Float[Array, ""] = eqx.field(
         converter=scalar("aerosol_scale_height"), default=1400.0
     )
-    lidar_ratio: Converted[Float[Array, ""] | None] = eqx.field(
-        converter=optional_scalar("lidar_ratio"), default=None
-    )
-    base_height: Converted[Float[Array, ""]] = eqx.field(converter=scalar("base_height"), default=0.0)
+    lidar_ratio: Float[Array, ""] | None = eqx.field(converter=optional_scalar("lidar_ratio"), default=None)
+    base_height: Float[Array, ""] = eqx.field(converter=scalar("base_height"), default=0.0)
 
     ranges: ClassVar = {
         "visibility": Range(0.0, low_open=True),

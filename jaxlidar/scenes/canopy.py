@@ -23,9 +23,7 @@ from jaxlidar._checks import (
     concrete,
     kind_of,
 )
-from jaxlidar._converted import Converted
 from jaxlidar._ranges import FRACTION
-from jaxlidar._signatures import briefly
 from jaxlidar._text import object_text
 from jaxlidar.optics.phase import AbstractPhase
 from jaxlidar.optics.spectra import Spectrum, reflectance_at
@@ -38,7 +36,6 @@ def _as_bark(x: Any) -> Any:
 
 
 @final
-@briefly
 class Canopy(eqx.Module):
     """A canopy: leaf and bark in voxels, with their optical properties.
 
@@ -76,7 +73,7 @@ class Canopy(eqx.Module):
 
     voxels: VoxelMap
     leaf: Callable | AbstractPhase | None = None
-    bark: Converted[Reflectance | AbstractPhase | None] = eqx.field(converter=_as_bark, default=None)
+    bark: Reflectance | AbstractPhase | None = eqx.field(converter=_as_bark, default=None)
     transmission: str = eqx.field(static=True, default="diffuse")
     hotspot: bool = eqx.field(static=True, default=True)
     sides: str = eqx.field(static=True, default="open")

@@ -26,16 +26,13 @@ from jaxlidar._checks import (
     check_numbers,
     check_range,
     check_shape,
-    check_unmasked,
     concrete,
     concrete_array,
     is_traced,
     kind_of,
 )
-from jaxlidar._converted import Converted
 from jaxlidar._products import einsum, matmul
 from jaxlidar._ranges import SUM_OF_FRACTIONS, Range, check_ranges
-from jaxlidar._signatures import briefly
 from jaxlidar._vectors import FAR, Scalar, Vec, along, dot, vec
 from jaxlidar.optics.laws import AbstractLaw, AbstractMirror, Lambertian
 from jaxlidar.optics.spectra import Spectrum
@@ -82,7 +79,6 @@ def _coordinates(field: str, x: Any, columns: int) -> Array | np.ndarray:
 
 
 @final
-@briefly
 class MeshInstances(eqx.Module):
     """Places of copies of a mesh: each is scaled and rotated about the mesh's own origin, then shifted.
 
@@ -155,7 +151,6 @@ def _matrices(rotation: Any, scale: Any, xp: Any) -> Any:
 
 
 @final
-@briefly
 class MeshSurface(eqx.Module):
     """A surface of triangles that stops light: roofs, trunks, wires, leaves, whole trees.
 
@@ -335,7 +330,6 @@ def _mesh_arrays(
             "vertices within by equinox.tree_at"
         )
     vertices = as_numpy(vertices, "vertices")
-    check_unmasked("faces", faces)
     faces = np.asarray(faces)
     if faces.dtype.kind not in "iu":
         raise TypeError(f"faces is an array of {faces.dtype}; admissible are integers")
@@ -378,7 +372,7 @@ class MeshMaterial(AbstractSheet):
     mesh: MeshSurface
     label: str = eqx.field(static=True)
     transmission: str = eqx.field(static=True, default="diffuse")
-    coverage: Converted[Float[Array, ""]] = eqx.field(converter=as_scalar, default=1.0)
+    coverage: Float[Array, ""] = eqx.field(converter=as_scalar, default=1.0)
 
     @property
     def name(self) -> str:

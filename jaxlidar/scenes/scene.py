@@ -11,9 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxlidar._checks import check_kind, concrete, is_traced, kind_of
-from jaxlidar._converted import Converted
 from jaxlidar._ranges import Range
-from jaxlidar._signatures import briefly
 from jaxlidar._text import object_text
 from jaxlidar._vectors import FAR
 from jaxlidar.instrument.lidar import Lidar
@@ -36,7 +34,6 @@ def _as_tuple(x: Any) -> Any:
 
 
 @final
-@briefly
 class Scene(eqx.Module):
     """A scene: the canopy, plates, ground, atmosphere and meshes that a lidar observes.
 
@@ -68,10 +65,10 @@ class Scene(eqx.Module):
     """
 
     canopy: Canopy | None = None
-    plates: Converted[tuple[AbstractSheet, ...]] = eqx.field(converter=_as_tuple, default=())
+    plates: tuple[AbstractSheet, ...] = eqx.field(converter=_as_tuple, default=())
     ground: AbstractGround | None = None
     atmosphere: Atmosphere | None = None
-    meshes: Converted[tuple[MeshSurface, ...]] = eqx.field(converter=_as_tuple, default=())
+    meshes: tuple[MeshSurface, ...] = eqx.field(converter=_as_tuple, default=())
 
     ranges: ClassVar = {"gap": Range(MIN_GAP)}
 

@@ -30,9 +30,7 @@ from jaxlidar._checks import (
     coordinates,
     scalar,
 )
-from jaxlidar._converted import Converted
 from jaxlidar._ranges import FRACTION, SUM_OF_FRACTIONS, Range, check_ranges
-from jaxlidar._signatures import briefly
 from jaxlidar._text import object_text
 from jaxlidar.optics.laws import AbstractLaw, Lambertian
 from jaxlidar.optics.spectra import Spectrum
@@ -224,7 +222,6 @@ class AbstractSheet(AbstractSurface):
 
 
 @final
-@briefly
 class Ground(AbstractGround):
     """The ground: an infinite opaque plane, level or sloping.
 
@@ -250,12 +247,12 @@ class Ground(AbstractGround):
     normal: -0.342 north, 0.940 up
     """
 
-    height: Converted[Float[Array, ""]] = eqx.field(converter=scalar("height"), default=0.0)
-    reflectance: Converted[Reflectance] = eqx.field(converter=reflectance_field("reflectance"), default=0.3)
-    slope: Converted[Float[Array, ""]] = eqx.field(converter=scalar("slope"), default=0.0)
-    aspect: Converted[Float[Array, ""]] = eqx.field(converter=scalar("aspect"), default=0.0)
+    height: Float[Array, ""] = eqx.field(converter=scalar("height"), default=0.0)
+    reflectance: Reflectance = eqx.field(converter=reflectance_field("reflectance"), default=0.3)
+    slope: Float[Array, ""] = eqx.field(converter=scalar("slope"), default=0.0)
+    aspect: Float[Array, ""] = eqx.field(converter=scalar("aspect"), default=0.0)
     law: AbstractLaw = Lambertian()
-    position: Converted[Float[Array | np.ndarray, " 2"]] = eqx.field(
+    position: Float[Array | np.ndarray, " 2"] = eqx.field(
         converter=coordinates("position", 2), default=(0.0, 0.0)
     )
 
@@ -279,7 +276,6 @@ class Ground(AbstractGround):
 
 
 @final
-@briefly
 class Plate(AbstractSheet):
     """A leaf plate: an infinite sheet with a reflectance and a transmittance, the same on both sides.
 
@@ -313,17 +309,15 @@ class Plate(AbstractSheet):
     0.15 of the light is absorbed
     """
 
-    height: Converted[Float[Array, ""]] = eqx.field(converter=scalar("height"))
-    reflectance: Converted[Reflectance] = eqx.field(converter=reflectance_field("reflectance"))
-    transmittance: Converted[Reflectance] = eqx.field(
-        converter=reflectance_field("transmittance"), default=0.0
-    )
-    coverage: Converted[Float[Array, ""]] = eqx.field(converter=scalar("coverage"), default=1.0)
-    slope: Converted[Float[Array, ""]] = eqx.field(converter=scalar("slope"), default=0.0)
-    aspect: Converted[Float[Array, ""]] = eqx.field(converter=scalar("aspect"), default=0.0)
+    height: Float[Array, ""] = eqx.field(converter=scalar("height"))
+    reflectance: Reflectance = eqx.field(converter=reflectance_field("reflectance"))
+    transmittance: Reflectance = eqx.field(converter=reflectance_field("transmittance"), default=0.0)
+    coverage: Float[Array, ""] = eqx.field(converter=scalar("coverage"), default=1.0)
+    slope: Float[Array, ""] = eqx.field(converter=scalar("slope"), default=0.0)
+    aspect: Float[Array, ""] = eqx.field(converter=scalar("aspect"), default=0.0)
     transmission: str = eqx.field(static=True, default="straight")
     law: AbstractLaw = Lambertian()
-    position: Converted[Float[Array | np.ndarray, " 2"]] = eqx.field(
+    position: Float[Array | np.ndarray, " 2"] = eqx.field(
         converter=coordinates("position", 2), default=(0.0, 0.0)
     )
 

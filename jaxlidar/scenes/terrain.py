@@ -33,9 +33,7 @@ from jaxlidar._checks import (
     concrete_array,
     coordinates,
 )
-from jaxlidar._converted import Converted
 from jaxlidar._ranges import FRACTION, Range, check_ranges
-from jaxlidar._signatures import briefly
 from jaxlidar._vectors import normalise
 from jaxlidar.optics.laws import AbstractLaw, AbstractMirror, Lambertian
 from jaxlidar.optics.spectra import Spectrum
@@ -68,7 +66,6 @@ def _pair(field: str) -> Callable[[Any], Float[Array, "2"]]:
 
 
 @final
-@briefly
 class Terrain(AbstractGround):
     """Terrain: an opaque ground whose height is given at the nodes of a grid, and bilinear in between.
 
@@ -109,12 +106,10 @@ class Terrain(AbstractGround):
     0.268, of 0.268
     """
 
-    heights: Converted[Float[Array, "..."]] = eqx.field(converter=array("heights"))
-    spacing: Converted[Float[Array, "2"]] = eqx.field(converter=_pair("spacing"))
-    origin: Converted[Float[Array | np.ndarray, "2"]] = eqx.field(
-        converter=coordinates("origin", 2), default=(0.0, 0.0)
-    )
-    reflectance: Converted[Reflectance | Float[Array, "nx ny"]] = eqx.field(
+    heights: Float[Array, "..."] = eqx.field(converter=array("heights"))
+    spacing: Float[Array, "2"] = eqx.field(converter=_pair("spacing"))
+    origin: Float[Array | np.ndarray, "2"] = eqx.field(converter=coordinates("origin", 2), default=(0.0, 0.0))
+    reflectance: Reflectance | Float[Array, "nx ny"] = eqx.field(
         converter=reflectance_field("reflectance"), default=0.3
     )
     law: AbstractLaw = Lambertian()

@@ -26,9 +26,7 @@ from jaxlidar._checks import (
     coordinates,
     warn_units,
 )
-from jaxlidar._converted import Converted
 from jaxlidar._ranges import Range, check_ranges
-from jaxlidar._signatures import briefly
 from jaxlidar._text import object_text
 from jaxlidar.optics.leaf_angles import LeafAngles
 from jaxlidar.scenes.terrain import Terrain
@@ -62,7 +60,6 @@ def _volume(field: str) -> Callable[[Numbers | None], Float[Array, "..."] | None
 
 
 @final
-@briefly
 class VoxelMap(eqx.Module):
     """A voxel map: extinction coefficients of leaf and bark in a box of equal voxels, x east, y north, z up.
 
@@ -94,10 +91,10 @@ class VoxelMap(eqx.Module):
     """
 
     # The shapes are not part of the types: the constructor compares them, and its error names both.
-    leaf: Converted[Float[Array, "..."] | None] = eqx.field(converter=_volume("leaf"))
-    bark: Converted[Float[Array, "..."] | None] = eqx.field(converter=_volume("bark"))
-    voxel_size: Converted[Float[Array, "3"]] = eqx.field(converter=_triple("voxel_size"))
-    origin: Converted[Float[Array | np.ndarray, "3"]] = eqx.field(converter=coordinates("origin", 3))
+    leaf: Float[Array, "..."] | None = eqx.field(converter=_volume("leaf"))
+    bark: Float[Array, "..."] | None = eqx.field(converter=_volume("bark"))
+    voxel_size: Float[Array, "3"] = eqx.field(converter=_triple("voxel_size"))
+    origin: Float[Array | np.ndarray, "3"] = eqx.field(converter=coordinates("origin", 3))
     leaf_angles: LeafAngles | None = None
 
     ranges: ClassVar = {

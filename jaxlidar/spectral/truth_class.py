@@ -5,11 +5,8 @@ from typing import final
 import equinox as eqx
 from jaxtyping import Array, Float
 
-from jaxlidar._checks import briefly
-
 
 @final
-@briefly
 class Truth(eqx.Module):
     """Truth of a waveform, sample by sample: gaps, areas and heights along the beam, from the scene itself.
 

@@ -18,8 +18,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxlidar._checks import briefly, check_range, is_traced
-from jaxlidar._deprecated import renamed_property
+from jaxlidar._checks import check_range, is_traced
 from jaxlidar._registry import detect_returns, save_result, true_returns, waveform_html
 from jaxlidar._summary import summary
 from jaxlidar.instrument.lidar import Lidar
@@ -39,7 +38,6 @@ from jaxlidar.trace.response import Response
 
 
 @final
-@briefly
 class Waveform(eqx.Module):
     """A simulated waveform: apparent reflectance and received energy by wavelength and sample.
 
@@ -106,9 +104,6 @@ class Waveform(eqx.Module):
     wavelength: Float[Array, "wavelengths"]
     info: dict = eqx.field(static=True)
     truth: Truth | None = None
-
-    ledger = renamed_property("ledger", "energy_budget")
-    ledger_stderr = renamed_property("ledger_stderr", "energy_budget_stderr")
 
     @property
     def first_order_share(self) -> Float[Array, "wavelengths"]:

@@ -6,7 +6,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float, Int
 
-from jaxlidar._checks import briefly, concrete_array, concrete_number
+from jaxlidar._checks import concrete_array, concrete_number
 from jaxlidar.instrument.lidar import Lidar
 from jaxlidar.instrument.survey import Survey
 from jaxlidar.io.datasets import keep_as_netcdf
@@ -18,7 +18,6 @@ _MAX_PULSE_SAMPLES = 1_000_000
 
 
 @final
-@briefly
 class Acquisition(eqx.Module):
     """Times, scan angles, flight lines and ranges of shots, and the pulse and radiometry that they share.
 

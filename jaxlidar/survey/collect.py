@@ -4,13 +4,13 @@ import dataclasses
 import itertools
 import os
 import time
-import warnings
 from collections.abc import Iterator, Mapping, MutableMapping
 from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 
+from jaxlidar._checks import warn_user
 from jaxlidar._summary import NOTABLE_FRACTION, percent, unfollowed_message
 from jaxlidar.io.case import Case
 from jaxlidar.io.checkpoint import Checkpoint
@@ -151,18 +151,13 @@ def _warn_of_missing_light(strategy: AbstractStrategy, missing: _MissingLight) -
     """Warn if much light of a shot is after the record, or may be in orders that were not followed."""
     plan = strategy.setup.plan
     if plan.scope.automatic_orders and missing.unfollowed > strategy.rtol:
-        # As below, for the caller of `simulate_many`.
-        warnings.warn(
-            unfollowed_message(plan.orders, missing.unfollowed), UnfollowedLightWarning, stacklevel=4
-        )
+        warn_user(unfollowed_message(plan.orders, missing.unfollowed), UnfollowedLightWarning)
     if missing.late >= NOTABLE_FRACTION:
         end = plan.sample_start + plan.sample_interval * plan.n_samples
-        warnings.warn(
+        warn_user(
             f"{percent(missing.late)} of the light of a shot is still on its way when the record ends at "
             f"{end:.4g} ns: see Waveforms.energy_budget",
             LateLightWarning,
-            # The caller of `simulate_many`: above this function, its caller, and `simulate_many` itself.
-            stacklevel=4,
         )
 
 

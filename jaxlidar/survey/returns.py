@@ -45,7 +45,6 @@ from jaxtyping import Bool, Float, Int, Shaped
 
 from jaxlidar._checks import (
     as_numpy,
-    briefly,
     check_choice,
     check_integer,
     check_kind,
@@ -104,7 +103,6 @@ _ORDERS = ("first", "higher")
 
 
 @final
-@briefly
 class DiscreteReturns(eqx.Module):
     """Discrete returns of the shots of a survey, by shot and range. `len(returns)` is their number.
 

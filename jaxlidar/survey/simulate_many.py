@@ -11,7 +11,6 @@
 import functools
 import os
 import time
-import warnings
 from collections.abc import Callable, Collection, Iterator, Mapping, MutableMapping
 from concurrent.futures import Executor
 from pathlib import Path
@@ -28,6 +27,7 @@ from jaxlidar._checks import (
     check_kind,
     is_traced,
     is_within_program,
+    warn_user,
 )
 from jaxlidar._fingerprint import fingerprint
 from jaxlidar._registry import simulate_survey
@@ -173,7 +173,7 @@ def simulate_many(
         off_map_fractions = off_map(strategy.survey, setup.scene)
         heights = ground_heights(strategy.survey, setup.scene, setup.plan.limits.start_distance)
     if (message := off_map_message(off_map_fractions)) is not None:
-        warnings.warn(message, OffMapWarning, stacklevel=2)
+        warn_user(message, OffMapWarning)
     survey_fields: dict[str, Any] = {
         "position": survey.position,
         "zenith": survey.zenith,

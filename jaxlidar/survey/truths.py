@@ -10,7 +10,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from jaxlidar._checks import briefly
 from jaxlidar._programs import Program
 from jaxlidar._threads import ONE_CORE
 from jaxlidar._workers import WorkUnit, task
@@ -26,7 +25,6 @@ from jaxlidar.truth import Truth, compute_labels, first_order_setup
 
 
 @final
-@briefly
 class Truths(eqx.Module):
     """Truth of all shots of a survey: what their beams meet in a scene; axis 0 is the shots'.
 

@@ -10,9 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import ArrayLike, Float, Int
 
-from jaxlidar._checks import briefly, check_numbers
+from jaxlidar._checks import check_numbers
 from jaxlidar._constants import SPEED_OF_LIGHT
-from jaxlidar._deprecated import renamed_property
 from jaxlidar._not_kept import NotKept
 from jaxlidar._registry import detect_returns, true_returns
 from jaxlidar._summary import NOTABLE_FRACTION, percent
@@ -45,7 +44,6 @@ _LEAST_COSINE = 1e-12
 
 
 @final
-@briefly
 class Waveforms(eqx.Module):
     """The waveforms of all shots of a survey, on one time axis. `waves[i]` is the `Waveform` of shot i.
 
@@ -110,9 +108,6 @@ class Waveforms(eqx.Module):
     info: dict[str, Any] = eqx.field(static=True)
     truth: Truths | None = None
     acquisition: Acquisition | None = None
-
-    ledger = renamed_property("ledger", "energy_budget")
-    ledger_stderr = renamed_property("ledger_stderr", "energy_budget_stderr")
 
     @property
     def first_order_share(self) -> Float[np.ndarray, "shots wavelengths"]:
@@ -470,9 +465,7 @@ keep_as_netcdf(
     dimensions={"shots": "shot", "samples": "time", "wavelengths": "wavelength", "axes": "axis"},
     items={"components": "component", "energy_budget": "fate", "energy_budget_stderr": "fate"},
     coordinates={"zenith": "shot", "azimuth": "shot"},
-    former_names={"energy_budget": "ledger", "energy_budget_stderr": "ledger_stderr"},
     rows="shots",
-    added=("acquisition",),
 )
 
 

@@ -5,13 +5,12 @@ goes straight on: of all meshes only the triangle that a ray meets first counts.
 through the tree, and the surface of that triangle's material gets its distance, all others `FAR`.
 """
 
-import warnings
-
 import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Int
 
+from jaxlidar._checks import warn_user
 from jaxlidar._vectors import FAR, Scalar, Vec, along, dot
 from jaxlidar.scenes.shapes import OutlineWarning
 from jaxlidar.trace.device_scene import DeviceScene
@@ -73,5 +72,5 @@ def _(primals, tangents):
         "derivatives through a mesh are those where the return is smooth: they leave out how light comes to "
         "meet outlines and edges of the mesh or to miss them"
     )
-    warnings.warn(message, OutlineWarning, stacklevel=2)
+    warn_user(message, OutlineWarning)
     return primals[0], tangents[0]

@@ -21,8 +21,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from jaxlidar._checks import briefly, check_flag, check_key, check_kind
-from jaxlidar._deprecated import renamed_property
+from jaxlidar._checks import check_flag, check_key, check_kind
 from jaxlidar._mesh_axes import vary_together, vary_with, with_automatic_axes
 from jaxlidar._products import einsum, tensordot
 from jaxlidar.planning.setup import Setup
@@ -41,7 +40,6 @@ Traced = TypeVar("Traced")
 
 
 @final
-@briefly
 class Response(eqx.Module):
     """The geometric weight of all paths, by last material, scattering history and fine time bin.
 
@@ -80,7 +78,6 @@ class Response(eqx.Module):
     escaped: Float[Array, "traces histories"]
     late: Float[Array, "traces histories"]
     remaining: Float[Array, "traces histories"]
-    left = renamed_property("left", "departed")
 
 
 @with_automatic_axes

@@ -6,13 +6,13 @@ material.
 """
 
 import dataclasses
-import warnings
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxlidar._checks import warn_user
 from jaxlidar._vectors import FAR, Scalar, Vec, along, dot, scale
 from jaxlidar.optics.laws import AbstractLaw
 from jaxlidar.scenes.height_field import HeightField
@@ -108,7 +108,7 @@ def _(primals, tangents):
         "derivatives through a shape without the method `outline` leave out how light comes to meet it or to "
         "miss it as it moves or grows: see jaxlidar.AbstractShape.outline"
     )
-    warnings.warn(message, OutlineWarning, stacklevel=2)
+    warn_user(message, OutlineWarning)
     return primals[0], tangents[0]
 
 

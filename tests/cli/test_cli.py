@@ -193,8 +193,9 @@ def test_compiled_programs_are_stored_unless_refused(tmp_path):
     def stored_programs(*argv):
         command = [sys.executable, "-c", code, *argv, "prospect", "--N", "1.5"]
         process = subprocess.run(command, env=environment, capture_output=True, text=True)
-        # Reading programs from the cache gives no warnings.
-        assert process.stderr == ""
+        assert process.returncode == 0, process.stderr
+        # JAX before 0.11 logs an error for each program that it reads on a CPU.
+        assert jax.__version_info__ < (0, 11) or process.stderr == ""
         assert process.stdout.splitlines()[-1] == "0 True"
         return {path.name for path in tmp_path.rglob("*-cache")}
 

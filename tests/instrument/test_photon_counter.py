@@ -12,6 +12,7 @@ Means are tested by z-scores, distributions by Kolmogorov-Smirnov and chi-square
 import dataclasses
 import functools
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -37,11 +38,12 @@ def some_wave(wavelength):
 def wave_of(photons, time, wavelength=(GREEN,)):
     """Make a `Waveform` with the given expected number of photons per sample, (wavelengths, bins)."""
     energy = np.atleast_2d(photons) * PLANCK_TIMES_LIGHT / np.asarray(wavelength)[:, None]
-    return dataclasses.replace(
+    height = -0.5 * jl.SPEED_OF_LIGHT * np.asarray(time)
+    # Not by the constructor: the fields that photon counting does not use have another number of samples.
+    return eqx.tree_at(
+        lambda wave: (wave.time, wave.height, wave.energy),
         some_wave(wavelength),
-        time=jnp.asarray(time, float),
-        height=jnp.asarray(-0.5 * jl.SPEED_OF_LIGHT * np.asarray(time), float),
-        energy=jnp.asarray(energy, float),
+        tuple(jnp.asarray(values, float) for values in (time, height, energy)),
     )
 
 
@@ -313,11 +315,11 @@ def test_inadmissible_records_are_refused():
     with pytest.raises(TypeError, match="wave is an array of float64; admissible where mode = 'photons' is"):
         jl.record(np.ones((1, 2)), mode="photons", key=key)
     with pytest.raises(
-        ValueError, match="energy = -1 is too far below zero; admissible are samples that all"
+        ValueError, match=r"energy = -.* is too far below zero; admissible are samples that all"
     ):
-        jl.record(dataclasses.replace(wave, energy=wave.energy - 1), mode="photons", key=key)
+        jl.record(wave_of(-np.ones(10), np.arange(10.0)), mode="photons", key=key)
     with pytest.raises(ValueError, match="energy = nan"):
-        jl.record(dataclasses.replace(wave, energy=wave.energy + np.nan), mode="photons", key=key)
+        jl.record(wave_of(np.full(10, np.nan), np.arange(10.0)), mode="photons", key=key)
     with pytest.raises(ValueError, match=r"detection_probability has shape \(2,\)"):
         events_of(wave, 1, detection_probability=(0.1, 0.2))
     with pytest.raises(ValueError, match="wave has one sample"):

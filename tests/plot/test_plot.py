@@ -223,13 +223,6 @@ def test_the_energy_budget_adds_up_to_100_percent(wave, axes):
     assert np.allclose(bars["absorbed by leaf"], 100 * np.asarray(wave.energy_budget["absorbed by leaf"]))
 
 
-def test_the_old_name_of_the_energy_budget_warns():
-    with pytest.warns(DeprecationWarning, match=r"plot\.ledger"):
-        assert plot.ledger is plot.energy_budget
-    with pytest.raises(AttributeError, match="no attribute 'legder'"):
-        _ = plot.legder
-
-
 def test_accuracy_has_the_error_and_the_target(wave, axes):
     steps = [jl.Progress(8 * n, 65536 * n, 0.1 * n, 0.02 / n**0.5, 0.01) for n in (4, 1)]
     assert plot.accuracy(steps, axes) is axes

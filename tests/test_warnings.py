@@ -1,0 +1,89 @@
+"""A warning names the user's line, whatever lies between that line and the place that warns."""
+
+import linecache
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxlidar as jl
+from jaxlidar._checks import warn_user
+
+KEY = jax.random.key(5)
+LIDAR = jl.Lidar()
+# Light goes to and fro between the plate and the ground when the record ends.
+BRIGHT = jl.Scene(plates=(jl.Plate(80.0, 0.4, 0.5),), ground=jl.Ground(reflectance=0.9))
+
+
+def line_of_warning(call, category):
+    """Return the source line that the first warning of a category names."""
+    with pytest.warns(category) as caught:
+        call()
+    warning = next(w for w in caught if issubclass(w.category, category))
+    assert warning.filename == __file__
+    return linecache.getline(warning.filename, warning.lineno)
+
+
+def test_one_shot():
+    def call():
+        jl.simulate(LIDAR, BRIGHT, key=KEY, n_photons=2_000, max_orders=4)
+
+    assert "jl.simulate(" in line_of_warning(call, jl.LateLightWarning)
+
+
+def test_a_survey():
+    survey = jl.Survey(LIDAR, np.zeros((2, 2)))
+
+    def call():
+        jl.simulate_many(survey, BRIGHT, key=KEY, rtol=0.2, max_orders=4)
+
+    assert "jl.simulate_many(" in line_of_warning(call, jl.LateLightWarning)
+
+
+def test_a_survey_that_leaves_the_map():
+    voxels = jl.VoxelMap.from_lad(np.full((4, 4, 2), 0.5), voxel_size=1.0)
+    scene = jl.Scene(canopy=jl.Canopy(voxels, leaf=jl.LeafOptics(0.4, 0.4)), ground=jl.Ground())
+    survey = jl.Survey(LIDAR, np.full((2, 2), 50.0))
+
+    def call():
+        jl.simulate_many(survey, scene, key=KEY, rtol=0.2, max_orders=1)
+
+    assert "jl.simulate_many(" in line_of_warning(call, jl.OffMapWarning)
+
+
+def test_a_derivative_that_jax_takes():
+    mesh = (np.array([[-9.0, -9.0, 0.0], [9.0, -9.0, 0.0], [0.0, 9.0, 0.0]]), np.array([[0, 1, 2]]))
+    surface = jl.MeshSurface(mesh, reflectance=0.4)
+    plan = jl.plan(LIDAR, jl.Scene(meshes=(surface,)), max_orders=1, n_rays=64)
+
+    def energy(height):
+        moved = eqx.tree_at(
+            lambda s: s.vertices, surface, surface.vertices + height * jnp.array([[0.0, 0.0, 1.0]])
+        )
+        wave = jl.simulate(LIDAR, jl.Scene(meshes=(moved,)), key=KEY, plan=plan)
+        return wave.energy.sum()
+
+    assert "jl.simulate(" in line_of_warning(lambda: jax.jacfwd(energy)(0.1), jl.OutlineWarning)
+
+
+def test_a_reader(tmp_path):
+    path = tmp_path / "tree.csv"
+    names = "ID,parentID,startX,startY,startZ,endX,endY,endZ,radius"
+    path.write_text(f"{names}\n1,-1,0,0,0,0,0,2,0.1\n3,2,0,0,3,0,0,4,0.05\n")
+    assert "jl.io.read_qsm(" in line_of_warning(lambda: jl.io.read_qsm(path), jl.io.FileWarning)
+
+
+def test_a_constructor():
+    assert "jl.Lidar(" in line_of_warning(lambda: jl.Lidar(divergence=3e-4), jl.UnitWarning)
+
+
+def test_frames_of_other_packages_are_the_users():
+    """The line of a package that is not of the project is named, not that of its caller."""
+    namespace = {"__name__": "jaxlidar_extension", "warn_user": warn_user}
+    code = compile("def warn():\n    warn_user('a message')\n", "extension.py", "exec")
+    exec(code, namespace)
+    with pytest.warns(UserWarning, match="a message") as caught:
+        namespace["warn"]()
+    assert (caught[0].filename, caught[0].lineno) == ("extension.py", 2)
