@@ -206,7 +206,7 @@ def reflectance_factor(
     # Standard errors have no derivatives: they would be those of the noise.
     variance = jnp.var(jax.lax.stop_gradient(batches), axis=0) / (MIN_BATCHES - 1)
     return ReflectanceFactor(
-        reflectance=jnp.mean(batches, axis=0) * setup.admissible,
+        reflectance=jnp.mean(batches, axis=0) * setup.nan_unless_covered(),
         stderr=student_widening(MIN_BATCHES) * jnp.sqrt(variance),
         unfollowed=jnp.mean(unfollowed, axis=0),
     )
@@ -380,6 +380,8 @@ def _make_plan(
         lengths = PathLengths(lidar, scene)
         height = lengths.size[2] * lengths.shape[2]
         max_faces = max(max_faces, size_bucket(lengths.voxels_along(height / sun_cosine)))
+    # Light that is not followed is in the result, whatever the albedo: brighter scenes share the program.
+    plan = dataclasses.replace(plan, scope=plan.scope._replace(albedo=1.0))
     return plan.with_limits(start_distance=float(start_distance)).with_config(
         vertical=is_vertical, max_faces=max_faces
     )

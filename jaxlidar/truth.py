@@ -144,7 +144,9 @@ def compute_labels(scene: DeviceScene, model: WaveformModel) -> Truth:
     aim_height = lidar.aim_point[2]
     sums = _sum_rays(scene, samples, across, energy, axis_heights)
     # A traced value outside its range makes all labels NaN.
-    sums = jax.tree.map(lambda a: model.admissible * a, sums)
+    # Truth has no `lost`, which would tell what the plan does not cover.
+    factor = jnp.where(model.is_covered, model.admissible, jnp.nan)
+    sums = jax.tree.map(lambda a: factor * a, sums)
     intercepted_from = jnp.cumsum(sums.rows[0][::-1])[::-1]
     remaining = sums.passing + intercepted_from[samples.max_span : samples.max_span + samples.count + 1]
     # All of the energy is one or the other: the ratio takes off what the sums round.
