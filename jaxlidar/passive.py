@@ -225,7 +225,8 @@ def plan_reflectance(
     """Make the plan of `reflectance_factor`, for scenes that a JAX transformation traces.
 
     The plan serves other values of the same scene whose canopy and surfaces reach no higher, and other
-    directions no farther from the zenith.
+    directions no farther from the zenith. Within a JAX transformation the reflectance factor is NaN for
+    others, as far as they concern the view; the sun is not checked.
 
     **Arguments:** `scene`, `sun`, `view`, `wavelengths`, `n_photons`, `max_orders`, `area`: as for
     `reflectance_factor`.

@@ -74,7 +74,7 @@ class SceneWaveforms(eqx.Module):
 
     @property
     def lost(self) -> Float[Array, "scenes wavelengths"]:
-        """Apparent reflectance outside of the fine bins of the plan, (scenes, wavelengths)."""
+        """As `Waveform.lost`, (scenes, wavelengths): 1 at least where the plan covers no such scene."""
         return self.waveforms.lost
 
     def __len__(self) -> int:

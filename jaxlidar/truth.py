@@ -61,7 +61,8 @@ def truth_of(lidar: Lidar, scene: Scene, *, plan: Plan | None = None) -> Truth:
     **Arguments:**
 
     - `lidar`: a `Lidar`. - `scene`: a `Scene`.
-    - `plan`: a `Plan` of `jaxlidar.plan`, whose samples and number of rays are used. It must be given where
+    - `plan`: a `Plan` of `jaxlidar.plan` (the truth is NaN where JAX traces what it does not cover), whose
+      samples and number of rays are used. It must be given where
       geometry is traced by a JAX transformation. Default None: that of `simulate`.
 
     **Returns:** a `Truth`. It is deterministic. Derivatives are those of amounts; as places move from sample
