@@ -19,6 +19,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Float
 
@@ -156,6 +157,19 @@ def concrete_array(x: object) -> np.ndarray:
             "make a plan outside with jaxlidar.plan and pass it as plan="
         )
     return value
+
+
+def array_namespace(x: object) -> Any:
+    """Return the module whose functions take `x`: `jax.numpy` for JAX arrays, else `numpy`."""
+    return jnp if isinstance(x, jax.Array) else np
+
+
+def fixed_array(x: Any, xp: Any) -> Any:
+    """Convert an array for computations without derivatives: in double precision with `xp` = numpy.
+
+    **Raises:** ValueError where `x` is being traced by a JAX transformation and `xp` is numpy.
+    """
+    return concrete_array(x) if xp is np else lax.stop_gradient(jnp.asarray(x, float))
 
 
 def _is_numeric(x: object) -> bool:

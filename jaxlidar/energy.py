@@ -207,6 +207,9 @@ def _by_name(fractions: Any, materials: Sequence[str]) -> dict[str, Float[Array,
 def _with_longest_flights(setup: Setup) -> Setup:
     """Follow flights as far as they may go, whatever the record's window is."""
     canopy, plan = setup.scene.canopy, setup.plan
+    # Neither the albedo nor the tolerance of the plan matters here: scenes share the program.
+    plan = dataclasses.replace(plan, rtol=1.0, scope=plan.scope._replace(albedo=1.0))
+    setup = dataclasses.replace(setup, plan=plan)
     if canopy is None or canopy.sides == "open":
         return setup
     lengths = PathLengths(setup.lidar, setup.scene)

@@ -211,7 +211,7 @@ def reflectance_factor(
     # Standard errors have no derivatives: they would be those of the noise.
     variance = jnp.var(jax.lax.stop_gradient(batches), axis=0) / (MIN_BATCHES - 1)
     return ReflectanceFactor(
-        reflectance=jnp.mean(batches, axis=0) * setup.admissible,
+        reflectance=jnp.mean(batches, axis=0) * setup.nan_unless_covered(),
         stderr=student_widening(MIN_BATCHES) * jnp.sqrt(variance),
         unfollowed=jnp.mean(unfollowed, axis=0),
     )
@@ -230,7 +230,8 @@ def plan_reflectance(
     """Make the plan of `reflectance_factor`, for scenes that a JAX transformation traces.
 
     The plan serves other values of the same scene whose canopy and surfaces reach no higher, and other
-    directions no farther from the zenith.
+    directions no farther from the zenith. Within a JAX transformation the reflectance factor is NaN for
+    others, as far as they concern the view; the sun is not checked.
 
     **Arguments:** `scene`, `sun`, `view`, `wavelengths`, `n_photons`, `max_orders`, `area`: as for
     `reflectance_factor`.
@@ -385,6 +386,8 @@ def _make_plan(
         lengths = PathLengths(lidar, scene)
         height = lengths.size[2] * lengths.shape[2]
         max_faces = max(max_faces, size_bucket(lengths.voxels_along(height / sun_cosine)))
+    # Light that is not followed is in the result, whatever the albedo: brighter scenes share the program.
+    plan = dataclasses.replace(plan, scope=plan.scope._replace(albedo=1.0))
     return plan.with_limits(start_distance=float(start_distance)).with_config(
         vertical=is_vertical, max_faces=max_faces
     )

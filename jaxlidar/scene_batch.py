@@ -21,7 +21,8 @@ from jaxlidar._threads import ONE_CORE, side_by_side
 from jaxlidar.instrument.lidar import Lidar
 from jaxlidar.planning.memory import memory_limit, transformed_bytes
 from jaxlidar.planning.plan import Plan
-from jaxlidar.planning.scene_family import plan_scenes, stack_size
+from jaxlidar.planning.plan_check import check_plan
+from jaxlidar.planning.scene_family import plan_scenes, scene_of_stack, stack_size
 from jaxlidar.scenes.scene import Scene, check_kinds
 from jaxlidar.simulate import simulate
 from jaxlidar.spectral.waveform import Waveform
@@ -73,7 +74,7 @@ class SceneWaveforms(eqx.Module):
 
     @property
     def lost(self) -> Float[Array, "scenes wavelengths"]:
-        """Apparent reflectance outside of the fine bins of the plan, (scenes, wavelengths)."""
+        """As `Waveform.lost`, (scenes, wavelengths): 1 at least where the plan covers no such scene."""
         return self.waveforms.lost
 
     def __len__(self) -> int:
@@ -108,8 +109,8 @@ def simulate_scenes(
     The waveform of scene i is that of `simulate(lidar, scene_i, plan=plan, key=jax.random.fold_in(key, i))`
     within a JAX transformation: eight batches of the plan's photons and rays, whatever the error, or a single
     pass where nothing is random. It does not depend on the other scenes. Within a transformation values are
-    not refused: waveforms are NaN where a value of a scene lies outside of its range, and light that the plan
-    does not cover is in `lost`. The result can be differentiated with respect to lidar and scenes.
+    not refused: waveforms are NaN where a value of a scene lies outside of its range, and `lost` is 1 where
+    the plan does not cover a scene. The result can be differentiated with respect to lidar and scenes.
 
     **Arguments:**
 
@@ -124,8 +125,9 @@ def simulate_scenes(
 
     **Returns:** a `SceneWaveforms`, with standard errors of each scene.
 
-    **Raises:** ValueError for arrays that are no stack and other inadmissible arguments, and for scenes that
-    are traced by a JAX transformation without a plan. TypeError for arguments of another kind.
+    **Raises:** ValueError for arrays that are no stack and other inadmissible arguments, for a plan that does
+    not cover one of the scenes, and for scenes that are traced by a JAX transformation without a plan.
+    TypeError for arguments of another kind.
 
     **Example:**
 
@@ -145,6 +147,7 @@ def simulate_scenes(
     if chunk is not None:
         chunk = check_integer("chunk", chunk)
     is_transformed = any(is_traced(x) for x in jax.tree.leaves((lidar, scenes, key)))
+    refuses = plan is not None
     if plan is None:
         if is_transformed:
             raise ValueError(
@@ -160,7 +163,7 @@ def simulate_scenes(
         waveform_of_scene = _scene_simulation(lidar, plan, key)
         waveforms = jax.lax.map(lambda pair: waveform_of_scene(*pair), (scenes, numbers), batch_size=size)
         return SceneWaveforms(waveforms)
-    return SceneWaveforms(_simulate_in_chunks(lidar, scenes, plan, key, number, size))
+    return SceneWaveforms(_simulate_in_chunks(lidar, scenes, plan, key, number, size, refuses))
 
 
 def _affordable_chunk(plan: Plan) -> int:
@@ -185,18 +188,31 @@ def _simulate_chunk(
     return jax.vmap(_scene_simulation(lidar, plan, key))(scenes, numbers)
 
 
+def _refuse_uncovered(lidar: Lidar, scenes: Scene, plan: Plan, numbers: np.ndarray) -> None:
+    """Refuse a plan that does not cover one of the scenes with these numbers.
+
+    Their waveforms say that they may not be covered; the check itself takes milliseconds for each scene.
+    """
+    for i in numbers:
+        scene = jax.tree.map(jnp.asarray, scene_of_stack(scenes, int(i)))
+        try:
+            check_plan(plan, lidar, scene)
+        except ValueError as error:
+            raise ValueError(f"scenes[{i}]: {error}; plan_scenes makes one for all scenes") from error
+
+
 # One core each: chunks run side by side on threads.
 _compiled_chunk = Program(_simulate_chunk, **ONE_CORE)
 
 
 def _simulate_in_chunks(
-    lidar: Lidar, scenes: Scene, plan: Plan, key: PRNGKeyArray, number: int, size: int
+    lidar: Lidar, scenes: Scene, plan: Plan, key: PRNGKeyArray, number: int, size: int, refuses: bool
 ) -> Waveform:
     """Simulate chunk after chunk on all cores, and join them.
 
     1. Take the rows of each chunk on the host; the last is filled up with its last scene, so that all chunks
        have one shape, and share one program.
-    2. Simulate chunks side by side.
+    2. Simulate chunks side by side; where `refuses`, refuse a scene that the plan does not cover.
     3. Join their waveforms, without what filled up the last.
     """
     host_scenes = jax.tree.map(np.asarray, scenes)
@@ -205,7 +221,10 @@ def _simulate_in_chunks(
         rows = np.minimum(np.arange(start, start + size), number - 1)
         chunk_scenes = jax.tree.map(lambda a: a[rows], host_scenes)
         wave = _compiled_chunk(lidar, chunk_scenes, plan, key, rows.astype(np.int32))
-        return jax.tree.map(lambda a: np.asarray(a)[: number - start], wave)
+        wave = jax.tree.map(lambda a: np.asarray(a)[: number - start], wave)
+        if refuses:
+            _refuse_uncovered(lidar, host_scenes, plan, start + np.flatnonzero((wave.lost >= 1).all(axis=1)))
+        return wave
 
     with side_by_side() as run:
         waves = list(run(simulate_rows, range(0, number, size)))

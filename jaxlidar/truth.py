@@ -61,7 +61,8 @@ def truth_of(lidar: Lidar, scene: Scene, *, plan: Plan | None = None) -> Truth:
     **Arguments:**
 
     - `lidar`: a `Lidar`. - `scene`: a `Scene`.
-    - `plan`: a `Plan` of `jaxlidar.plan`, whose samples and number of rays are used. It must be given where
+    - `plan`: a `Plan` of `jaxlidar.plan` (the truth is NaN where JAX traces what it does not cover), whose
+      samples and number of rays are used. It must be given where
       geometry is traced by a JAX transformation. Default None: that of `simulate`.
 
     **Returns:** a `Truth`. It is deterministic. Derivatives are those of amounts; as places move from sample
@@ -144,7 +145,9 @@ def compute_labels(scene: DeviceScene, model: WaveformModel) -> Truth:
     aim_height = lidar.aim_point[2]
     sums = _sum_rays(scene, samples, across, energy, axis_heights)
     # A traced value outside its range makes all labels NaN.
-    sums = jax.tree.map(lambda a: model.admissible * a, sums)
+    # Truth has no `lost`, which would tell what the plan does not cover.
+    factor = jnp.where(model.is_covered, model.admissible, jnp.nan)
+    sums = jax.tree.map(lambda a: factor * a, sums)
     intercepted_from = jnp.cumsum(sums.rows[0][::-1])[::-1]
     remaining = sums.passing + intercepted_from[samples.max_span : samples.max_span + samples.count + 1]
     # All of the energy is one or the other: the ratio takes off what the sums round.

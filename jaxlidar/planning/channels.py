@@ -6,13 +6,13 @@ weight prod_s optics_s ** n_s; the tuple (n_s) is its history.
 """
 
 from collections import Counter
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxlidar._checks import concrete
+from jaxlidar._checks import concrete, fixed_array
 from jaxlidar.instrument.lidar import Lidar
 from jaxlidar.optics.phase import AbstractPhase
 from jaxlidar.optics.spectra import reflectance_at
@@ -114,14 +114,20 @@ def channel_optics(
     return jnp.stack(rows) if rows else jnp.zeros((0, lidar.wavelength.size))
 
 
-def largest_albedo(optics: list[MaterialOptics]) -> float:
-    """Return the largest R + T of any material and wavelength; 1 where its value is being traced."""
-    albedos = [0.0]
+def largest_albedo(optics: list[MaterialOptics], xp: Any = np) -> Any:
+    """Return the largest R + T of any material and wavelength; 1 where its value is being traced.
+
+    With `xp` = jax.numpy a traced value counts as it is.
+    """
+    albedos: list[Any] = [0.0]
     for material_optics in optics:
         terms = [a for a in (material_optics.reflectance, material_optics.transmittance) if a is not None]
+        if xp is jnp:
+            albedos.append(jnp.max(sum(fixed_array(a, jnp) for a in terms)))
+            continue
         values = [value for value in map(concrete, terms) if value is not None]
         albedos.append(float(np.max(sum(values))) if len(values) == len(terms) else 1.0)
-    return max(albedos)
+    return max(albedos) if xp is np else jnp.max(jnp.stack([jnp.asarray(a) for a in albedos]))
 
 
 def reflection_probability(optics: list[MaterialOptics]) -> float:

@@ -14,11 +14,12 @@ more than the tolerance, optics are applied while light is traced: then there is
 """
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+import jax.numpy as jnp
 import numpy as np
 
-from jaxlidar._checks import concrete, concrete_array
+from jaxlidar._checks import concrete, concrete_array, fixed_array
 from jaxlidar._constants import SPEED_OF_LIGHT
 from jaxlidar.planning.channels import MaterialOptics, largest_albedo
 from jaxlidar.planning.effects import allows_interreflection
@@ -78,11 +79,15 @@ def order_steps(orders: int, n_plates: int, n_channels: int) -> int:
     return steps if histories <= MAX_BUCKETED_HISTORIES else orders
 
 
-def mean_optical_depth(canopy: Canopy) -> float:
+def mean_optical_depth(canopy: Canopy, xp: Any = np) -> Any:
     """Return the vertical optical depth of the canopy, the mean over its columns that are not empty.
 
-    Infinite where extinction is being traced.
+    Infinite where extinction is being traced, unless `xp` is jax.numpy.
     """
+    if xp is jnp:
+        tables = [fixed_array(a, jnp) for a in (canopy.voxels.leaf, canopy.voxels.bark) if a is not None]
+        columns = sum(table.sum(axis=2) for table in tables) * fixed_array(canopy.voxels.voxel_size, jnp)[2]
+        return columns.sum() / jnp.maximum((columns > 0).sum(), 1)
     extinction = np.zeros(canopy.voxels.shape[:2])
     for table in (canopy.voxels.leaf, canopy.voxels.bark):
         if table is None:
@@ -96,39 +101,46 @@ def mean_optical_depth(canopy: Canopy) -> float:
     return float(occupied.mean()) if occupied.size else 0.0
 
 
-def scattered_again(scene: Scene, optics: list[MaterialOptics]) -> float:
+def scattered_again(scene: Scene, optics: list[MaterialOptics], xp: Any = np) -> Any:
     """Estimate the fraction q = p w of scattered light that is scattered again (see the module).
 
     1. The least recollision probability times the largest albedo.
     2. A canopy: the decay of the slowest diffusion mode; ground that reflects makes its slab deeper.
     3. Between two surfaces, or of a mesh with itself: the root of the product of their reflectances.
 
-    q is the largest of these, and at most 1.
+    q is the largest of these, and at most 1. `xp`: jax.numpy for values that a JAX transformation traces.
     """
-    return min(max(MIN_RECOLLISION * largest_albedo(optics), slowest_decay(scene, optics)), 1.0)
+    fraction = xp.maximum(MIN_RECOLLISION * largest_albedo(optics, xp), slowest_decay(scene, optics, xp))
+    return _number(xp.minimum(fraction, 1.0), xp)
 
 
-def slowest_decay(scene: Scene, optics: list[MaterialOptics]) -> float:
+def _number(x: Any, xp: Any) -> Any:
+    return float(x) if xp is np else x
+
+
+def slowest_decay(scene: Scene, optics: list[MaterialOptics], xp: Any = np) -> Any:
     """Estimate the ratio of successive orders in the slowest mode: steps 2 and 3 of `scattered_again`.
 
     Zero for a canopy of an optical depth of at most one, which diffusion does not describe.
     """
-    albedo, fraction = largest_albedo(optics), 0.0
+    albedo, fraction = largest_albedo(optics, xp), 0.0
     if scene.canopy is not None:
-        ground = 0.0 if scene.ground is None else _largest_reflectance(optics, "ground")
-        depth = mean_optical_depth(scene.canopy) * (1.0 + ground)
-        if depth > 1.0:
-            fraction = max(fraction, albedo * (1.0 - math.pi**2 / 3 / (depth + 1.42) ** 2))
+        ground = 0.0 if scene.ground is None else _largest_reflectance(optics, "ground", xp)
+        depth = mean_optical_depth(scene.canopy, xp) * (1.0 + ground)
+        fraction = xp.where(depth > 1.0, albedo * (1.0 - math.pi**2 / 3 / (depth + 1.42) ** 2), 0.0)
     surfaces = [o.name for o in optics if o.name not in ("leaf", "bark")]
     # A mesh may face itself, as the walls of a street do.
     surfaces += [name for name in surfaces if name.partition(":")[0].startswith("mesh")]
-    reflectances = sorted((_largest_reflectance(optics, name) for name in surfaces), reverse=True)
-    if len(reflectances) > 1:
-        fraction = max(fraction, math.sqrt(reflectances[0] * reflectances[1]))
-    return min(fraction, 1.0)
+    if len(surfaces) > 1:
+        reflectances = xp.stack([xp.asarray(_largest_reflectance(optics, name, xp)) for name in surfaces])
+        fraction = xp.maximum(fraction, xp.sqrt(xp.prod(xp.sort(reflectances)[-2:])))
+    return _number(xp.minimum(fraction, 1.0), xp)
 
 
-def _largest_reflectance(optics: list[MaterialOptics], name: str) -> float:
+def _largest_reflectance(optics: list[MaterialOptics], name: str, xp: Any = np) -> Any:
+    if xp is jnp:
+        (reflectance,) = (fixed_array(o.reflectance, jnp) for o in optics if o.name == name)
+        return jnp.max(reflectance)
     (reflectance,) = (concrete(o.reflectance) for o in optics if o.name == name)
     return 1.0 if reflectance is None else float(np.max(reflectance))
 
@@ -149,13 +161,8 @@ def choose_orders(
     """
     if not allows_interreflection(scene):
         return OrderChoice(1, "one plane cannot light itself", 0.0, 1)
-    n_plates, fraction, albedo = len(scene.plates), scattered_again(scene, optics), largest_albedo(optics)
-    affordable = 2
-    while affordable < MAX_ORDERS_OF_HISTORIES:
-        n_histories = math.comb(max_degree(affordable + 1, n_plates) + n_channels, n_channels)
-        if n_histories > MAX_HISTORIES:
-            break
-        affordable += 1
+    fraction, albedo = scattered_again(scene, optics), largest_albedo(optics)
+    affordable = affordable_orders(scene, n_channels)
     if max_orders is None:
         is_known = all(concrete(o.reflectance) is not None for o in optics) and math.isfinite(
             0.0 if scene.canopy is None else mean_optical_depth(scene.canopy)
@@ -170,6 +177,39 @@ def choose_orders(
         return OrderChoice(1, "one order is asked for", 0.0, affordable)
     reason = f"orders 2 to {count}; largest albedo {albedo:.2f}"
     return OrderChoice(count, reason, fraction**count, affordable, applies_optics)
+
+
+def calls_for_more_orders(
+    scene: Scene,
+    optics: list[MaterialOptics],
+    n_channels: int,
+    rtol: float,
+    orders: int,
+    histories: bool,
+    xp: Any,
+) -> Any:
+    """Return True if `choose_orders` would follow more than so many orders for a tolerance.
+
+    It follows 1 + ln(rtol / 10) / ln q, rounded up, and two at least. `xp`: jax.numpy for values that a JAX
+    transformation traces.
+    """
+    if not allows_interreflection(scene):
+        return False
+    possible = MAX_ORDERS if not histories else affordable_orders(scene, n_channels)
+    if orders >= possible:
+        return False
+    return (orders < 2) | (xp.maximum(scattered_again(scene, optics, xp), 1e-6) ** (orders - 1) > rtol / 10)
+
+
+def affordable_orders(scene: Scene, n_channels: int) -> int:
+    """Return the largest number of orders for which the table of histories stays small enough."""
+    n_plates, affordable = len(scene.plates), 2
+    while affordable < MAX_ORDERS_OF_HISTORIES:
+        n_histories = math.comb(max_degree(affordable + 1, n_plates) + n_channels, n_channels)
+        if n_histories > MAX_HISTORIES:
+            break
+        affordable += 1
+    return affordable
 
 
 def orders_to_tolerance(fraction: float, rtol: float) -> int:

@@ -5,14 +5,17 @@ footprint radii out. All but a negligible fraction of the light lies between the
 """
 
 import math
-from typing import NamedTuple
+from collections.abc import Iterator
+from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jax import lax
+from jaxtyping import Array, Float
 
-from jaxlidar._checks import concrete_array, concrete_number, is_traced
-from jaxlidar._vectors import FAR
+from jaxlidar._checks import array_namespace, concrete_array, concrete_number, fixed_array, is_traced
+from jaxlidar._vectors import FAR, vec
 from jaxlidar.instrument.lidar import AIM_DISTANCE, Lidar
 from jaxlidar.instrument.survey import Survey
 from jaxlidar.planning.config import KERNEL_BINS
@@ -47,6 +50,36 @@ _PATH_RADII, _TERRAIN_RADII = 2.5, 2.0
 _REACH_RADII = 4.0
 
 
+class TracedBeam(NamedTuple):
+    """The beam of a lidar that a JAX transformation traces, in the form of a `Survey` of one shot."""
+
+    direction: Any
+    aim_point: Any
+    slant_range: Any
+    footprint_radius: Any
+    zenith: Any
+    has_sensor_position: bool
+    lidar: Lidar
+
+    @staticmethod
+    def of(lidar: Lidar) -> "TracedBeam":
+        """Return the beam of a lidar, with JAX arrays without derivatives."""
+        values = (
+            lidar.direction,
+            lidar.aim_point,
+            lidar.range_to_reference,
+            lidar.footprint_radius,
+            lidar.zenith,
+        )
+        values = (fixed_array(a, jnp)[None] for a in values)
+        return TracedBeam(*values, lidar.has_sensor_position, lidar)
+
+    @property
+    def sensor(self) -> Any:
+        """Position (1, 3) of the sensor in m."""
+        return self.aim_point - self.slant_range[:, None] * self.direction
+
+
 class FootprintRims(NamedTuple):
     """Lines along the axis of each beam, first, and around it.
 
@@ -55,31 +88,33 @@ class FootprintRims(NamedTuple):
     - `slant_range`: distance of the aim point from the sensor, m.
     """
 
-    aim: Float[np.ndarray, "shots lines 3"]
-    points: Float[np.ndarray, "shots lines 3"]
-    rays: Float[np.ndarray, "shots lines 3"]
-    distance: Float[np.ndarray, "shots lines"]
-    slant_range: Float[np.ndarray, "shots lines"]
+    aim: Float[np.ndarray | Array, "shots lines 3"]
+    points: Float[np.ndarray | Array, "shots lines 3"]
+    rays: Float[np.ndarray | Array, "shots lines 3"]
+    distance: Float[np.ndarray | Array, "shots lines"]
+    slant_range: Float[np.ndarray | Array, "shots lines"]
 
 
-def footprint_rims(survey: Survey, n_radii: float) -> FootprintRims:
+def footprint_rims(survey: Survey | TracedBeam, n_radii: float) -> FootprintRims:
     """Return the axes of all beams, and lines around them `n_radii` footprint radii out."""
-    n_points = _RIM_POINTS if len(survey) <= _MANY_FOOTPRINTS else _COARSE_RIM_POINTS
+    axis, slant_range = survey.direction, survey.slant_range
+    xp = array_namespace(axis)
+    n_points = _RIM_POINTS if len(axis) <= _MANY_FOOTPRINTS else _COARSE_RIM_POINTS
     # A coarse polygon is laid about the rim instead of into it, so that it encloses the rim.
     polygon_inradius = 1.0 if n_points == _RIM_POINTS else np.cos(np.pi / n_points)
     radius = n_radii * survey.footprint_radius / polygon_inradius
-    axis, slant_range = survey.direction, survey.slant_range
     # Any direction across the axis; of x and y that which is not nearly along it.
-    across = np.cross(axis, np.where(np.abs(axis[:, :1]) < 0.7, [[1.0, 0, 0]], [[0, 1.0, 0]]))
-    across /= np.linalg.norm(across, axis=1, keepdims=True)
-    third = np.cross(axis, across)
+    others = np.array([[1.0, 0.0, 0.0]]), np.array([[0.0, 1.0, 0.0]])
+    across = xp.cross(axis, xp.where(xp.abs(axis[:, :1]) < 0.7, *others))
+    across = across / xp.linalg.norm(across, axis=1, keepdims=True)
+    third = xp.cross(axis, across)
     angle = np.linspace(0, 2 * np.pi, n_points + 1)[:, None]
     circle = np.cos(angle) * across[:, None] + np.sin(angle) * third[:, None]
-    points = np.pad(radius[:, None, None] * circle, ((0, 0), (1, 0), (0, 0)))
+    points = xp.pad(radius[:, None, None] * circle, ((0, 0), (1, 0), (0, 0)))
     rays = (axis * slant_range[:, None])[:, None] + points
-    distance = np.linalg.norm(rays, axis=2)
-    aim = np.broadcast_to(survey.aim_point[:, None], points.shape)
-    slant_range = np.broadcast_to(slant_range[:, None], distance.shape)
+    distance = xp.linalg.norm(rays, axis=2)
+    aim = xp.broadcast_to(survey.aim_point[:, None], points.shape)
+    slant_range = xp.broadcast_to(slant_range[:, None], distance.shape)
     return FootprintRims(aim, points, rays / distance[..., None], distance, slant_range)
 
 
@@ -97,20 +132,26 @@ class PathLengths:
     - `start_distance`: distance before the reference plane, m, at which all rays start.
     - `vertical`: True if all beams are at nadir.
 
+    - `reaches_sensor`: with `xp` = jax.numpy, where all of these are JAX arrays: True if the scene reaches up
+      to the sensor, or the sensor is where it cannot be.
+
     For shots that are placed by their sensors, paths count from these, and rays start there.
 
     **Raises:** ValueError where the scene reaches up to the sensor; and for a sensor below the ground or in a
     plate, and a level beam within a canopy that has no sides.
     """
 
-    def __init__(self, lidar: Lidar, scene: Scene, survey: Survey | None = None):
-        self.scene = scene
-        shots = Survey.of(lidar) if survey is None else survey
+    def __init__(self, lidar: Lidar, scene: Scene, survey: Survey | None = None, *, xp: Any = np):
+        """`xp`: jax.numpy for a lidar or a scene that a JAX transformation traces; default numpy."""
+        self.scene, self.xp = scene, xp
+        # Of one lidar alone: no survey is traced.
+        shots = TracedBeam.of(lidar) if xp is jnp else Survey.of(lidar) if survey is None else survey
         self.from_sensor = shots.has_sensor_position
-        self.vertical = not np.any(shots.zenith) and not self.from_sensor
+        self.vertical = xp is np and not np.any(shots.zenith) and not self.from_sensor
+        self.reaches_sensor: Any = False
         if scene.canopy is not None:
             v = scene.canopy.voxels
-            self.size, self.shape = concrete_array(v.voxel_size), np.array(v.shape)
+            self.size, self.shape = fixed_array(v.voxel_size, xp), np.array(v.shape)
         if self.from_sensor:
             self._from_sensors(shots)
             return
@@ -120,32 +161,36 @@ class PathLengths:
         )
         # Distances from the reference plane at which rays meet surfaces, and the map's bottom and top.
         crossings = []
-        for s in (surface for surface in scene.surfaces if not isinstance(surface, MeshMaterial)):
-            crossed, towards = s.shape.crossing(points + aim, self.rays)
+        for s, crossed, towards in self._surface_crossings(aim, points):
             # Sheets are met from both sides, the ground only from above.
-            met = np.abs(towards) > 1e-6 if isinstance(s, AbstractSheet) else towards < -1e-6
-            if met.any():
-                crossings.append(crossed[met])
-        radius = _PATH_RADII * float(shots.footprint_radius.max())
+            met = xp.abs(towards) > 1e-6 if isinstance(s, AbstractSheet) else towards < -1e-6
+            crossings.append((crossed, met))
+        radius = _PATH_RADII * shots.footprint_radius.max()
         for mesh in scene.meshes:
-            lines = (points + aim, self.rays, radius, float(slant_range.min()))
-            crossings.append(_mesh_crossings(mesh, *lines, repeats=scene.period is not None))
+            lines = (points + aim, self.rays, radius, slant_range.min())
+            crossings += _mesh_crossings(mesh, *lines, repeats=scene.period is not None)
         if scene.canopy is not None:
-            low = concrete_array(scene.canopy.voxels.origin)[2]
+            low = fixed_array(scene.canopy.voxels.origin, xp)[2]
             for z in (low, low + self.size[2] * self.shape[2]):
-                crossings.append((z - points[:, 2]) / self.rays[:, 2])
-        distances = np.concatenate(crossings) if crossings else np.zeros(0)
-        distances = distances if distances.size else np.zeros(1)
-        nearest, farthest = float(distances.min()), float(distances.max())
+                crossed = (z - points[:, 2]) / self.rays[:, 2]
+                crossings.append((crossed, xp.ones_like(crossed, bool)))
+        nearest, farthest = self._extremes(crossings, otherwise=0.0)
         self.first_path = 2.0 * nearest
-        # Rays at the rim are longer than the axis, from which paths are counted.
-        self.last_path = 2.0 * (farthest + float(np.max(distance - slant_range)))
+        # Rays at the rim are longer than the axis, from which paths are counted. They are hypotenuses: the
+        # difference of the squares keeps the digits that that of the lengths would lose.
+        square = (points * points).sum(axis=1)
+        self.last_path = 2.0 * (farthest + xp.max(square / (distance + slant_range)))
         # A twentieth of the extent before the first surface: the plan also serves scenes a little higher. Far
         # from the reference plane the margin exceeds the rounding of single precision: a ray that starts on a
         # surface misses it.
-        margin = max(1e-3, _ROUNDING * max(abs(nearest), abs(farthest)))
+        margin = xp.maximum(1e-3, _ROUNDING * xp.maximum(xp.abs(nearest), xp.abs(farthest)))
         self.start_distance = 0.05 * (farthest - nearest) + margin - nearest
-        least_range = float(np.min(slant_range))
+        least_range = xp.min(slant_range)
+        if xp is jnp:
+            self.reaches_sensor = self.start_distance >= least_range
+            return
+        self.first_path, self.last_path = float(self.first_path), float(self.last_path)
+        self.start_distance = float(self.start_distance)
         if self.start_distance >= least_range:
             altitude = concrete_number(lidar.altitude)
             # The range of the aim point is in proportion to the altitude.
@@ -155,7 +200,7 @@ class PathLengths:
                 f"admissible is more than {lowest_altitude:g} m"
             )
 
-    def _from_sensors(self, shots: Survey) -> None:
+    def _from_sensors(self, shots: Survey | TracedBeam) -> None:
         """Set the path lengths of shots that are placed by their sensors.
 
         1. Refuse sensors within surfaces or below the ground, and endless rays.
@@ -163,64 +208,99 @@ class PathLengths:
         3. Their extremes, with the width of the beam to spare: between the lines it may reach the edge of a
            box a little earlier or later.
         """
-        scene = self.scene
-        check_sensors(shots, scene)
+        scene, xp = self.scene, self.xp
+        if isinstance(shots, Survey):
+            check_sensors(shots, scene)
+        else:
+            misplaced = [is_bad.any() for *_, is_bad in misplaced_sensors(shots, scene)]
+            self.reaches_sensor = jnp.any(jnp.stack(misplaced)) if misplaced else False
         aim, points, self.rays, distance, _ = (
             array.reshape(-1, *array.shape[2:]) for array in footprint_rims(shots, _PATH_RADII)
         )
         sensor = aim + points - distance[:, None] * self.rays
-        intervals = []
-        radius = _PATH_RADII * float(shots.footprint_radius.max())
+        crossings = []
+        radius = _PATH_RADII * shots.footprint_radius.max()
         for mesh in scene.meshes:
             lines, repeats = (sensor, self.rays, radius, AIM_DISTANCE), scene.period is not None
-            intervals.append(_mesh_crossings(mesh, *lines, repeats=repeats, ahead=True))
-        for s in (surface for surface in scene.surfaces if not isinstance(surface, MeshMaterial)):
+            crossings += _mesh_crossings(mesh, *lines, repeats=repeats, ahead=True)
+        for s in scene.surfaces:
             if isinstance(s, Terrain) and s.relief:
-                low, high = _box_of_terrain(s)
+                low, high = _box_of_terrain(s, xp)
                 enter, leave = _distances_to_box(sensor, self.rays, low, high)
-                met = leave > enter
-            else:
-                crossed, towards = s.shape.crossing(points + aim, self.rays)
-                least = math.sin(math.radians(LEAST_GRAZING_ANGLE))
-                met = np.abs(towards) > least if isinstance(s, AbstractSheet) else towards < -least
-                enter = leave = crossed + distance
-            met = met & (leave > 0)
-            intervals += [enter[met], leave[met]]
+                met = (leave > enter) & (leave > 0)
+                crossings += [(enter, met), (leave, met)]
+        for s, crossed, towards in self._surface_crossings(aim, points):
+            if isinstance(s, Terrain) and s.relief:
+                continue
+            least = math.sin(math.radians(LEAST_GRAZING_ANGLE))
+            met = xp.abs(towards) > least if isinstance(s, AbstractSheet) else towards < -least
+            crossed = crossed + distance
+            crossings.append((crossed, met & (crossed > 0)))
         if scene.canopy is not None:
             v, sides = scene.canopy.voxels, scene.canopy.sides
-            low, high = concrete_array(v.origin), concrete_array(v.top)
+            low, high = fixed_array(v.origin, xp), fixed_array(v.top, xp)
             if sides == "periodic":
                 low, high = (
-                    np.append(np.full(2, sign * np.inf), z) for sign, z in ((-1, low[2]), (1, high[2]))
+                    xp.append(np.full(2, sign * np.inf), z) for sign, z in ((-1, low[2]), (1, high[2]))
                 )
             enter, leave = _distances_to_box(sensor, self.rays, low, high)
-            met = leave > enter
-            intervals += [enter[met], leave[met]]
-        distances = np.concatenate(intervals) if intervals else np.zeros(0)
-        if distances.size == 0:
-            distances = np.full(1, AIM_DISTANCE)
-        spread = 2.0 * _PATH_RADII * float(shots.footprint_radius.max()) / AIM_DISTANCE
-        nearest = max(float(distances.min()), 0.0) * max(1.0 - spread, 0.0)
-        farthest = float(distances.max()) * (1.0 + spread)
-        self.first_path, self.last_path = 2.0 * nearest, 2.0 * farthest
+            crossings += [(enter, leave > enter), (leave, leave > enter)]
+        nearest, farthest = self._extremes(crossings, otherwise=AIM_DISTANCE)
+        spread = 2.0 * _PATH_RADII * shots.footprint_radius.max() / AIM_DISTANCE
+        nearest = xp.maximum(nearest, 0.0) * xp.maximum(1.0 - spread, 0.0)
+        self.first_path, self.last_path = 2.0 * nearest, 2.0 * farthest * (1.0 + spread)
+        if xp is np:
+            self.first_path, self.last_path = float(self.first_path), float(self.last_path)
         self.start_distance = AIM_DISTANCE
 
-    @property
-    def _least_cosine(self) -> float:
-        """Least cosine of any ray to the vertical; not zero, as level rays have."""
-        return max(float(np.abs(self.rays[:, 2]).min()), 1e-9)
+    def _surface_crossings(self, aim: Any, points: Any) -> Iterator[tuple[AbstractSurface, Any, Any]]:
+        """Yield surfaces that are no meshes, with the distances and cosines at which lines cross them."""
+        for surface in self.scene.surfaces:
+            if isinstance(surface, MeshMaterial):
+                continue
+            if self.xp is np:
+                yield surface, *surface.shape.crossing(points + aim, self.rays)
+                continue
+            # About the aim point, as the tracer has it: in single precision map coordinates have no digits
+            # for heights.
+            try:
+                yield surface, *surface.shape.moved(-aim[0]).crossing(points, self.rays)
+            except (jax.errors.ConcretizationTypeError, jax.errors.TracerArrayConversionError):
+                # A shape of the user's that computes with NumPy.
+                continue
+
+    def _extremes(self, crossings: list[tuple[Any, Any]], otherwise: float) -> tuple[Any, Any]:
+        """Return the smallest and the largest distance at which lines meet anything, or `otherwise`."""
+        xp = self.xp
+        if not crossings:
+            return (xp.asarray(otherwise),) * 2
+        distance, met = (xp.concatenate(arrays) for arrays in zip(*crossings))
+        is_any = met.any()
+        extremes = xp.where(met, distance, xp.inf).min(), xp.where(met, distance, -xp.inf).max()
+        nearest, farthest = (xp.where(is_any, extreme, otherwise) for extreme in extremes)
+        return nearest, farthest
 
     @property
-    def longest_chord(self) -> float:
+    def _least_cosine(self) -> Any:
+        """Least cosine of any ray to the vertical; not zero, as level rays have."""
+        return self.xp.maximum(self.xp.abs(self.rays[:, 2]).min(), 1e-9)
+
+    def _ceil(self, x: Any) -> Any:
+        """Round a bound up; a value that is above a whole number by rounding of single precision, down."""
+        return math.ceil(x) if self.xp is np else jnp.ceil(x * (1.0 - 1e-5))
+
+    @property
+    def longest_chord(self) -> Any:
         """Longest chord, m, of a footprint ray within one voxel."""
         if self.scene.canopy is None:
             return 1e-3
         # A chord ends at the voxel's diagonal, or where the most inclined ray leaves the layer. The relative
         # slack covers the rounding of single precision.
         least_cosine = self._least_cosine
-        return float(min(np.linalg.norm(self.size), self.size[2] / least_cosine)) * (1 + 1e-5)
+        chord = self.xp.minimum(self.xp.linalg.norm(self.size), self.size[2] / least_cosine) * (1 + 1e-5)
+        return float(chord) if self.xp is np else chord
 
-    def max_ray_segments(self, max_segment: float) -> int:
+    def max_ray_segments(self, max_segment: Any) -> Any:
         """Return a bound on the number of segments of a footprint ray, none longer than `max_segment` m.
 
         A segment ends where the ray leaves a layer, crosses a side face, has the greatest length, or meets a
@@ -228,19 +308,21 @@ class PathLengths:
         """
         if self.scene.canopy is None:
             return 0
-        least_cosine = self._least_cosine
+        xp, least_cosine = self.xp, self._least_cosine
         height = self.size[2] * self.shape[2]
-        columns = np.ceil(np.abs(self.rays[:, :2]).max(0) / least_cosine * height / self.size[:2]) + 1
+        rates = xp.abs(self.rays[:, :2]).max(0) / least_cosine * height / self.size[:2]
+        columns = [self._ceil(rate) + 1 for rate in rates]
         if self.scene.canopy.sides == "open":
             # Rays that leave an open map do not come back.
-            columns = np.minimum(columns, self.shape[:2])
+            columns = [xp.minimum(n, side) for n, side in zip(columns, self.shape)]
         longest = height / least_cosine
         if self.scene.canopy.sides == "open":
-            longest = min(longest, float(np.linalg.norm(self.size * self.shape)))
-        divided = 0 if max_segment >= self.longest_chord else math.ceil(longest / max_segment)
-        return int(self.shape[2] + columns.sum() + divided + len(self.scene.surfaces) + 2)
+            longest = xp.minimum(longest, xp.linalg.norm(self.size * self.shape))
+        divided = xp.where(max_segment >= self.longest_chord, 0, self._ceil(longest / max_segment))
+        count = self.shape[2] + sum(columns) + divided + len(self.scene.surfaces) + 2
+        return int(count) if xp is np else count
 
-    def longest_flight(self, path: float) -> float:
+    def longest_flight(self, path: float) -> Any:
         """Return the length, m, up to which flights are followed.
 
         It includes all flights whose light returns within `path` m of the first return. Within a periodic
@@ -252,20 +334,25 @@ class PathLengths:
             return FAR
         if self.from_sensor:
             # No flight is longer than the path that it is part of.
-            return float(min(path, self.longest_affordable_flight))
+            return self._affordable(path)
         # Let theta be the beam's zenith angle. A flight of s m within the canopy, up by at most its height,
         # comes closer to the sensor by at most s sin(theta) + height cos(theta). So it lengthens the path by
         # at least s (1 - sin(theta)) - height cos(theta).
-        height, cosine = self.size[2] * self.shape[2], float(np.abs(self.rays[:, 2]).min())
-        flight = (path + height * cosine) / max(1.0 - math.sqrt(1.0 - cosine * cosine), 0.1)
-        return float(min(flight, self.longest_affordable_flight))
+        height, cosine = self.size[2] * self.shape[2], self.xp.abs(self.rays[:, 2]).min()
+        sine = self.xp.linalg.norm(self.rays[:, :2], axis=1).max()
+        return self._affordable((path + height * cosine) / self.xp.maximum(1.0 - sine, 0.1))
+
+    def _affordable(self, flight: Any) -> Any:
+        flight = self.xp.minimum(flight, self.longest_affordable_flight)
+        return float(flight) if self.xp is np else flight
 
     @property
-    def longest_affordable_flight(self) -> float:
+    def longest_affordable_flight(self) -> Any:
         """Length, m, of the longest flight through a periodic canopy that crosses at most `MAX_VOXELS`."""
-        return float(max(MAX_VOXELS - self.shape[2], 1) / np.sum(1.0 / self.size[:2]))
+        length = max(int(MAX_VOXELS - self.shape[2]), 1) / self.xp.sum(1.0 / self.size[:2])
+        return float(length) if self.xp is np else length
 
-    def max_faces(self, path: float) -> int:
+    def max_faces(self, path: float) -> Any:
         """Return a bound on the number of voxel faces that a flight of `longest_flight(path)` crosses."""
         if self.scene.canopy is None:
             return 0
@@ -273,37 +360,59 @@ class PathLengths:
             return int(self.shape.sum()) + 3
         return self.voxels_along(self.longest_flight(path))
 
-    def voxels_along(self, flight: float) -> int:
+    def voxels_along(self, flight: Any) -> Any:
         """Return a bound on the voxels of a periodic canopy that a flight of that length, m, crosses."""
         # A flight crosses each layer once. Three more, one for each axis, as it starts within a voxel.
-        return int(self.shape[2] + sum(math.ceil(flight / s) for s in self.size[:2])) + 3
+        count = self.shape[2] + sum(self._ceil(flight / s) for s in self.size[:2]) + 3
+        return int(count) if self.xp is np else count
 
 
-def _box_of_terrain(terrain: Terrain) -> tuple[np.ndarray, np.ndarray]:
+def _box_of_terrain(terrain: Terrain, xp: Any) -> tuple[Any, Any]:
     """Return the lowest and the highest corner, m, of the box that holds a terrain; endless if it repeats."""
-    heights = concrete_array(terrain.heights)
-    low, high = (np.append(a, z) for a, z in zip(_extent(terrain), (heights.min(), heights.max())))
+    heights = fixed_array(terrain.heights, xp)
+    low, high = (xp.append(a, z) for a, z in zip(_extent(terrain, xp), (heights.min(), heights.max())))
     # Rounding of single precision, in which rays meet the terrain.
-    slack = np.array([0.0, 0.0, 1e-3 + _ROUNDING * float(np.abs(heights).max())])
+    slack = 1e-3 + _ROUNDING * xp.abs(heights).max()
+    slack = slack * np.array([0.0, 0.0, 1.0])
     return low - slack, high + slack
 
 
-def _extent(terrain: Terrain) -> tuple[np.ndarray, np.ndarray]:
+def _extent(terrain: Terrain, xp: Any) -> tuple[Any, Any]:
     if terrain.sides == "periodic":
-        return np.full(2, -np.inf), np.full(2, np.inf)
-    return concrete_array(terrain.origin), np.asarray(terrain.end, float)
+        return xp.full(2, -np.inf), xp.full(2, np.inf)
+    origin, spacing = fixed_array(terrain.origin, xp), fixed_array(terrain.spacing, xp)
+    return origin, origin + spacing * (np.asarray(terrain.heights.shape) - 1)
 
 
-def _distances_to_box(
-    start: Float[np.ndarray, "rays 3"], rays: Float[np.ndarray, "rays 3"], low: np.ndarray, high: np.ndarray
-) -> tuple[Float[np.ndarray, "rays"], Float[np.ndarray, "rays"]]:
+def _distances_to_box(start: Any, rays: Any, low: Any, high: Any) -> tuple[Any, Any]:
     """Return where rays enter a box, m, zero from within, and leave it; one number where they miss it."""
     # A ray along a face never crosses it: so far away that it does not count.
-    rate = np.where(np.abs(rays) < 1e-12, 1e-12, rays)
+    xp = array_namespace(rays)
+    rate = xp.where(xp.abs(rays) < 1e-12, 1e-12, rays)
     a, b = (low - start) / rate, (high - start) / rate
-    enter = np.maximum(np.minimum(a, b).max(axis=1), 0.0)
-    leave = np.maximum(np.maximum(a, b).min(axis=1), enter)
+    enter = xp.maximum(xp.minimum(a, b).max(axis=1), 0.0)
+    leave = xp.maximum(xp.maximum(a, b).min(axis=1), enter)
     return enter, leave
+
+
+def misplaced_sensors(shots: Survey | TracedBeam, scene: Scene) -> Iterator[tuple[str, Any, Any]]:
+    """Yield for each surface where a sensor cannot be, its distance, m, above it, and True if it is there.
+
+    Last is the angle from the level of beams within a canopy that has no sides.
+    """
+    xp = array_namespace(shots.direction)
+    for surface in scene.surfaces:
+        if isinstance(surface, MeshMaterial):
+            # Meshes need not be closed: none of their sides is the inside.
+            continue
+        height = _height_above(surface, shots.sensor)
+        if height is not None:
+            is_sheet = isinstance(surface, AbstractSheet)
+            distance = xp.abs(height) if is_sheet else height
+            yield "in a plate" if is_sheet else "below the ground", height, distance < LEAST_CLEARANCE
+    if scene.canopy is not None and scene.canopy.sides == "periodic":
+        off_level = xp.abs(shots.zenith - 90.0)
+        yield "level", off_level, off_level < LEAST_ELEVATION
 
 
 def check_sensors(shots: Survey, scene: Scene) -> None:
@@ -312,28 +421,15 @@ def check_sensors(shots: Survey, scene: Scene) -> None:
     **Raises:** ValueError with the shot and the numbers.
     """
     sensor, which = shots.sensor, "" if len(shots) == 1 else f" of shot {{}} of {len(shots)}"
-    for surface in scene.surfaces:
-        if isinstance(surface, MeshMaterial):
-            # Meshes need not be closed: none of their sides is the inside.
+    for where, height, is_bad in misplaced_sensors(shots, scene):
+        if not is_bad.any():
             continue
-        height = _height_above(surface, sensor)
-        if height is None:
-            continue
-        is_sheet = isinstance(surface, AbstractSheet)
-        bad = np.abs(height) < LEAST_CLEARANCE if is_sheet else height < LEAST_CLEARANCE
-        if bad.any():
-            i = int(np.argmax(bad))
-            where = "in a plate" if is_sheet else "below the ground"
+        i = int(np.argmax(is_bad))
+        if where != "level":
             raise ValueError(
                 f"sensor{which.format(i)} = {[round(float(x), 3) for x in sensor[i]]} is {where}, "
                 f"{float(height[i]):.3g} m above it; admissible is more than {LEAST_CLEARANCE:g} m"
             )
-    canopy = scene.canopy
-    if canopy is None or canopy.sides != "periodic":
-        return
-    off_level = np.abs(shots.zenith - 90.0)
-    if np.any(off_level < LEAST_ELEVATION):
-        i = int(np.argmin(off_level))
         raise ValueError(
             f"zenith{which.format(i)} = {float(shots.zenith[i]):g} degrees within a canopy with periodic "
             f"sides, which a level beam never leaves; admissible is {LEAST_ELEVATION:g} degree or more "
@@ -341,11 +437,20 @@ def check_sensors(shots: Survey, scene: Scene) -> None:
         )
 
 
-def _height_above(surface: AbstractSurface, sensor: Float[np.ndarray, "n 3"]) -> np.ndarray | None:
+def _height_above(surface: AbstractSurface, sensor: Any) -> Any:
     """Return distances, m, of sensors from a surface, positive above it; None where the shape states none.
 
     In double precision about the first sensor, as map coordinates need.
     """
+    if array_namespace(sensor) is jnp:
+        # About the sensor, as the tracer has it about the aim point.
+        shape = surface.shape.moved(-sensor[0])
+        if isinstance(shape, HeightField):
+            zero = vec(jnp.zeros((1,)) for _ in range(3))
+            return -lax.stop_gradient(shape.heights.value_and_slope(zero)[0])
+        if not isinstance(shape, Plane):
+            return None
+        return -jnp.sum(fixed_array(shape.foot, jnp) * fixed_array(shape.upward, jnp))[None]
     origin = sensor[0].copy()
     local = sensor - [origin[0], origin[1], 0.0]
     if isinstance(surface, Terrain) and surface.relief:
@@ -362,68 +467,78 @@ def _height_above(surface: AbstractSurface, sensor: Float[np.ndarray, "n 3"]) ->
 
 def _clipped(terrain: Terrain, sensor: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 2"]:
     """Return horizontal positions, those off the terrain moved to its border."""
-    low, high = _extent(terrain)
+    low, high = _extent(terrain, np)
     return np.clip(sensor[:, :2], low, high)
 
 
 def _mesh_crossings(
     mesh: MeshSurface,
-    points: Float[np.ndarray, "lines 3"],
-    rays: Float[np.ndarray, "lines 3"],
-    radius: float,
-    slant_range: float,
+    points: Any,
+    rays: Any,
+    radius: Any,
+    slant_range: Any,
     *,
     repeats: bool,
     ahead: bool = False,
-) -> Float[np.ndarray, " crossings"]:
+) -> list[tuple[Any, Any]]:
     """Return the distances from points along lines at which these enter and leave the box around a mesh.
 
+    **Returns:** twice (lines,) distances, m, and (lines,) True for lines that meet the box.
+
     A mesh may lie between the lines of a footprint. A ray of it is displaced from the axis by at most its
-    radius, across the axis: the box is enlarged by that much for each line. Empty where no ray meets it. With
-    `ahead`, the points are sensors, at which lines start: what lies behind them is not met. With `repeats`
-    copies of the mesh fill the layer in which it lies.
+    radius, across the axis: the box is enlarged by that much for each line. With `ahead`, the points are
+    sensors, at which lines start: what lies behind them is not met. With `repeats` copies of the mesh fill
+    the layer in which it lies.
     """
-    boxes = mesh.bounds()
+    xp = array_namespace(rays)
+    boxes = mesh.bounds(xp)
     low, high = boxes[:, 0].min(axis=0), boxes[:, 1].max(axis=0)
     if repeats:
-        low[:2], high[:2] = points[:, :2].min(axis=0) - _ENDLESS, points[:, :2].max(axis=0) + _ENDLESS
+        low = xp.append(points[:, :2].min(axis=0) - _ENDLESS, low[2])
+        high = xp.append(points[:, :2].max(axis=0) + _ENDLESS, high[2])
     # Beyond the aim point, beams are wider.
     if ahead and repeats:
         # Level beams end where the tracer gives up, far beyond any record.
-        depth = np.maximum(np.abs(low[2] - points[:, 2]), np.abs(high[2] - points[:, 2]))
-        beyond = float((depth / np.maximum(np.abs(rays[:, 2]), 1e-3)).max())
+        depth = xp.maximum(xp.abs(low[2] - points[:, 2]), xp.abs(high[2] - points[:, 2]))
+        beyond = (depth / xp.maximum(xp.abs(rays[:, 2]), 1e-3)).max()
     elif ahead:
         # No point of the box is farther from a sensor than the farthest corner.
-        beyond = float(np.linalg.norm(np.maximum(np.abs(low - points), np.abs(high - points)), axis=1).max())
+        farthest_corner = xp.maximum(xp.abs(low - points), xp.abs(high - points))
+        beyond = xp.linalg.norm(farthest_corner, axis=1).max()
     else:
-        beyond = float(np.abs([low[2], high[2]]).max())
+        beyond = xp.maximum(xp.abs(low[2]), xp.abs(high[2]))
     widened = radius * (1.0 + beyond / slant_range)
-    margin = widened * np.sqrt(np.maximum(1.0 - rays * rays, 0.0))
-    rates = np.where(np.abs(rays) < 1e-12, 1e-12, rays)
-    faces = np.stack([(low - margin - points) / rates, (high + margin - points) / rates])
+    margin = widened * xp.sqrt(xp.maximum(1.0 - rays * rays, 0.0))
+    rates = xp.where(xp.abs(rays) < 1e-12, 1e-12, rays)
+    faces = xp.stack([(low - margin - points) / rates, (high + margin - points) / rates])
     enter, leave = faces.min(axis=0).max(axis=1), faces.max(axis=0).min(axis=1)
-    enter = np.maximum(enter, 0.0) if ahead else enter
+    enter = xp.maximum(enter, 0.0) if ahead else enter
     is_met = enter <= leave
-    return np.concatenate([enter[is_met], leave[is_met]])
+    return [(enter, is_met), (leave, is_met)]
 
 
-def meshes_are_in_reach(shots: Lidar | Survey, scene: Scene) -> bool:
-    """Return True if unscattered light may meet a mesh; also where JAX is tracing a mesh."""
+def meshes_are_in_reach(shots: Lidar | Survey, scene: Scene, xp: Any = np) -> Any:
+    """Return True if unscattered light may meet a mesh; also where JAX is tracing a mesh.
+
+    `xp`: jax.numpy for a lidar that a JAX transformation traces; default numpy.
+    """
     if any(is_traced(x) for mesh in scene.meshes for x in jax.tree.leaves(mesh)):
         return True
-    survey = shots if isinstance(shots, Survey) else Survey.of(shots)
+    single = TracedBeam if xp is jnp else Survey
+    survey = shots if isinstance(shots, Survey) else single.of(shots)
     n_radii = _REACH_RADII if survey.lidar.profile == "gaussian" else 1.0
     rims = footprint_rims(survey, n_radii)
     points, rays = (a.reshape(-1, 3) for a in (rims.points + rims.aim, rims.rays))
     ahead = survey.has_sensor_position
     if ahead:
         points = points - rims.distance.reshape(-1, 1) * rays
-    radius, slant_range = n_radii * float(survey.footprint_radius.max()), float(rims.slant_range.min())
+    radius, slant_range = n_radii * survey.footprint_radius.max(), rims.slant_range.min()
     repeats = scene.period is not None
-    return any(
-        _mesh_crossings(mesh, points, rays, radius, slant_range, repeats=repeats, ahead=ahead).size
-        for mesh in scene.meshes
-    )
+    is_met: Any = False
+    for mesh in scene.meshes:
+        crossings = _mesh_crossings(mesh, points, rays, radius, slant_range, repeats=repeats, ahead=ahead)
+        is_met = is_met | crossings[0][1].any()
+    return is_met
 
 
 def longest_segment(chord: float, bin_length: float, max_step: float | None) -> tuple[float, int]:
@@ -440,6 +555,24 @@ def longest_segment(chord: float, bin_length: float, max_step: float | None) -> 
     bins = min(math.ceil(1.02 * chord / bin_length), _MAX_SEGMENT_BINS)
     span = max(size_bucket(bins + _SEGMENT_MARGIN, 4), KERNEL_BINS)
     return (span - _SEGMENT_MARGIN) * bin_length, span
+
+
+def footprint_is_off_terrain(lidar: Lidar, scene: Scene) -> Any:
+    """Return True where `check_footprints_on_terrain` refuses, of what a JAX transformation traces."""
+    ground = scene.ground
+    if not (isinstance(ground, Terrain) and ground.relief and ground.sides == "open"):
+        return False
+    if lidar.has_sensor_position:
+        return False
+    beam = TracedBeam.of(lidar)
+    rims = footprint_rims(beam, _TERRAIN_RADII if lidar.profile == "gaussian" else 1.0)
+    shape = ground.shape.moved(-beam.aim_point[0])
+    assert isinstance(shape, HeightField)
+    box, _, _ = shape.height_bounds_below(rims.points[0], rims.rays[0])
+    origin, end = (corner - beam.aim_point[0, :2] for corner in _extent(ground, jnp))
+    # Rounding of single precision.
+    slack = 1e-5 * (end - origin)
+    return jnp.any((box[0] < origin - slack) | (box[1] > end + slack))
 
 
 def check_footprints_on_terrain(shots: Lidar | Survey, scene: Scene) -> None:

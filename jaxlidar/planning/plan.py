@@ -148,10 +148,11 @@ class Plan:
     n_traces: int
     pulse_support: tuple[float, float]
     off: tuple[str, ...]
+    # Within a JAX transformation these decide what the plan covers.
+    rtol: float
+    scope: PlanScope
     # Compiled programs depend on none of the following.
-    rtol: float = dataclasses.field(compare=False)
     likely_beyond: float = dataclasses.field(compare=False)
-    scope: PlanScope = dataclasses.field(compare=False)
     memory: float = dataclasses.field(compare=False)
     effects: tuple[Effect, ...] = dataclasses.field(compare=False)
 

@@ -1,17 +1,33 @@
-"""Check that a plan that was made earlier serves a lidar and a scene."""
+"""Check that a plan that was made earlier serves a lidar and a scene.
 
-import math
+Each condition is stated once, as a `Misfit`. Where values are known, `check_plan` refuses a plan by it, with
+numbers. Where a JAX transformation traces them, nothing can be refused: `is_covered` evaluates the same
+comparisons with JAX arrays, and `Waveform.lost` tells.
+"""
+
 from collections.abc import Callable, Iterator, Sequence
+from typing import Any, NamedTuple
 
-from jaxlidar._checks import concrete_number
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool
+
+from jaxlidar._checks import concrete_number, fixed_array, is_traced
 from jaxlidar._constants import SPEED_OF_LIGHT
 from jaxlidar.instrument.lidar import Lidar
 from jaxlidar.optics.laws import AbstractMirror
-from jaxlidar.planning.channels import largest_albedo, number_channels, scene_optics
+from jaxlidar.planning.channels import largest_albedo, scene_optics
 from jaxlidar.planning.effects import consists_of_planes, find_empty_materials, without_effects
 from jaxlidar.planning.local_origin import move_aim_to_origin
-from jaxlidar.planning.orders import choose_orders
-from jaxlidar.planning.path_lengths import PathLengths, check_footprints_on_terrain, meshes_are_in_reach
+from jaxlidar.planning.orders import calls_for_more_orders, choose_orders
+from jaxlidar.planning.path_lengths import (
+    PathLengths,
+    check_footprints_on_terrain,
+    footprint_is_off_terrain,
+    meshes_are_in_reach,
+)
 from jaxlidar.planning.plan import Plan
 from jaxlidar.scenes.scene import Scene
 from jaxlidar.scenes.surfaces import AbstractSheet
@@ -21,12 +37,19 @@ from jaxlidar.scenes.terrain import Terrain
 _ROUNDING = 1e-5
 
 
+class Misfit(NamedTuple):
+    """A condition that a plan must meet: `is_present`, which may be traced, is True if it does not."""
+
+    is_present: Any
+    message: Callable[[], str]
+
+
 def check_plan(plan: Plan, lidar: Lidar, scene: Scene) -> None:
     """Refuse a plan that does not fit: one that would leave out light, or a part of the scene.
 
     **Raises:** ValueError that names what does not fit, with numbers.
     """
-    _check(plan, lidar, scene, (_misfit_materials, _misfit_lengths, _misfit_times, _misfit_pulse))
+    _check(plan, lidar, scene, _ALL_MISFITS)
 
 
 def check_reach(plan: Plan, lidar: Lidar, scene: Scene) -> None:
@@ -45,138 +68,223 @@ def check_pulse(plan: Plan, lidar: Lidar, scene: Scene) -> None:
     _check(plan, lidar, scene, (_misfit_pulse,))
 
 
+def is_covered(plan: Plan, lidar: Lidar, scene: Scene) -> Bool[Array, ""]:
+    """Return True if `check_plan` would not refuse a plan for a lidar and a scene that JAX is tracing.
+
+    Computed without derivatives, in single precision, whose rounding counts as covered.
+    """
+    arrays, static = eqx.partition((lidar, scene), eqx.is_array)
+    arrays = jax.tree.map(jax.lax.stop_gradient, arrays)
+    # NumPy's rules of broadcasting, by which both evaluate.
+    with jax.numpy_rank_promotion("allow"):
+        lidar, scene = eqx.combine(arrays, static)
+        misfits = _misfits(plan, lidar, scene, _ALL_MISFITS, jnp)
+        return ~jnp.any(jnp.stack([jnp.asarray(misfit.is_present) for misfit in misfits]))
+
+
 def _check(plan: Plan, lidar: Lidar, scene: Scene, checks: Sequence[Callable]) -> None:
     check_footprints_on_terrain(lidar, scene)
+    for misfit in _misfits(plan, lidar, scene, checks, np):
+        if misfit.is_present:
+            raise ValueError(f"the plan does not fit: {misfit.message()}")
+
+
+def _misfits(plan: Plan, lidar: Lidar, scene: Scene, checks: Sequence[Callable], xp: Any) -> Iterator[Misfit]:
+    """Yield all conditions; with `xp` = jax.numpy where values are traced."""
     ground = scene.ground
-    if plan.scope.flat_terrain and isinstance(ground, Terrain) and ground.relief and not ground.is_plane():
-        raise ValueError("the plan does not fit: it takes the terrain for a plane; make one for this terrain")
+    if xp is jnp:
+        yield Misfit(footprint_is_off_terrain(lidar, scene), lambda: "the footprint lies off the terrain")
+    # Of what the plan takes to be flat, empty or out of reach, `make_setup` refuses what is traced.
+    if plan.scope.flat_terrain and isinstance(ground, Terrain) and ground.relief:
+        has_relief = not is_traced(ground.heights) and not ground.is_plane()
+        yield Misfit(has_relief, lambda: "it takes the terrain for a plane; make one for this terrain")
     for name in plan.scope.empty_materials:
-        if name not in find_empty_materials(scene):
-            raise ValueError(
-                f"the plan does not fit: it is for a map without {name}; make one for this scene"
-            )
-    if plan.scope.unreached_meshes and meshes_are_in_reach(lidar, scene):
-        raise ValueError(
-            "the plan does not fit: it is for meshes that no ray meets; make one for this lidar and scene"
+        is_present = name not in find_empty_materials(scene)
+        yield Misfit(is_present, lambda name=name: f"it is for a map without {name}; make one for this scene")
+    if plan.scope.unreached_meshes:
+        yield Misfit(
+            meshes_are_in_reach(lidar, scene, xp),
+            lambda: "it is for meshes that no ray meets; make one for this lidar and scene",
         )
     # The plan is for the scene without the effects that it leaves out: compare like with like.
     lidar, scene = without_effects(*move_aim_to_origin(lidar, scene), plan.off)
     for check in checks:
-        for misfit in check(plan, lidar, scene):
-            raise ValueError(f"the plan does not fit: {misfit}; make one for this lidar and this scene")
+        for misfit in check(plan, lidar, scene, xp):
+            yield Misfit(
+                misfit.is_present,
+                lambda misfit=misfit: f"{misfit.message()}; make one for this lidar and this scene",
+            )
 
 
-def _misfit_materials(plan: Plan, lidar: Lidar, scene: Scene) -> Iterator[str]:
+def _misfit_materials(plan: Plan, lidar: Lidar, scene: Scene, xp: Any) -> Iterator[Misfit]:
     """Yield misfits in materials, their channels, and the orders that their albedo calls for."""
     optics, config, scope = scene_optics(lidar, scene), plan.config, plan.scope
-    scatterers = number_channels(optics)
-    missing, surplus = (
-        ", ".join(sorted(set(a) - set(b)))
-        for a, b in (
-            (scatterers.channels, config.channels),
-            (config.materials, scatterers.materials),
-        )
+    # A transmittance that is zero needs no channel.
+    missing = {f"{o.name}.R": True for o in optics} | {
+        f"{o.name}.T": xp.any(fixed_array(o.transmittance, xp) > 0)
+        for o in optics
+        if o.transmittance is not None
+    }
+    missing = {name: is_missing for name, is_missing in missing.items() if name not in config.channels}
+
+    def missing_channels() -> str:
+        names = ", ".join(sorted(name for name, is_missing in missing.items() if is_missing))
+        return f"it has {', '.join(config.channels) or 'no scatterers'}; the scene also has {names}"
+
+    for is_missing in missing.values():
+        yield Misfit(is_missing, missing_channels)
+    materials = tuple(o.name for o in optics)
+    yield Misfit(
+        config.materials != materials,
+        lambda: (
+            f"it has {', '.join(config.materials)}; the scene has {', '.join(materials) or 'no scatterers'}"
+        ),
     )
-    if missing:
-        yield f"it has {', '.join(config.channels) or 'no scatterers'}; the scene also has {missing}"
-    if surplus or config.materials != scatterers.materials:
-        has = ", ".join(scatterers.materials) or "no scatterers"
-        yield f"it has {', '.join(config.materials)}; the scene has {has}"
     # A plan may have a channel for a transmittance that is zero here, but not for one that the scene cannot
     # have.
     possible = {f"{o.name}.R" for o in optics} | {
         f"{o.name}.T" for o in optics if o.transmittance is not None
     }
     impossible = ", ".join(sorted(set(config.channels) - possible))
-    if impossible:
-        yield f"it has {impossible}; what the scene transmits is not scattered"
-    has_gaps = [isinstance(s, AbstractSheet) and concrete_number(s.coverage) < 1 for s in scene.surfaces]
-    if any(full and partial for full, partial in zip(config.covers_fully, has_gaps)):
-        yield "it has plates that cover everything; the scene's have gaps"
-    if config.mirrors != tuple(isinstance(s.law, AbstractMirror) for s in scene.surfaces):
-        yield "its surfaces and the scene's differ in which are mirrors"
+    yield Misfit(impossible != "", lambda: f"it has {impossible}; what the scene transmits is not scattered")
+    for covers_fully, surface in zip(config.covers_fully, scene.surfaces):
+        if covers_fully and isinstance(surface, AbstractSheet):
+            yield Misfit(
+                fixed_array(surface.coverage, xp) < 1,
+                lambda: "it has plates that cover everything; the scene's have gaps",
+            )
+    yield Misfit(
+        config.mirrors != tuple(isinstance(s.law, AbstractMirror) for s in scene.surfaces),
+        lambda: "its surfaces and the scene's differ in which are mirrors",
+    )
     hotspot = scene.canopy is not None and scene.canopy.hotspot
-    if config.hotspot != hotspot:
-        yield f"it has hotspot = {config.hotspot}; the canopy has hotspot = {hotspot}"
-    if config.vertical and concrete_number(lidar.zenith) != 0:
-        yield f"it is for a beam at nadir; zenith = {concrete_number(lidar.zenith):g} degrees"
-    if config.uses_quadrature and not consists_of_planes(scene):
-        yield "it is for planes; the scene has more"
+    yield Misfit(
+        config.hotspot != hotspot,
+        lambda: f"it has hotspot = {config.hotspot}; the canopy has hotspot = {hotspot}",
+    )
+    if config.vertical:
+        yield Misfit(
+            fixed_array(lidar.zenith, xp) != 0,
+            lambda: f"it is for a beam at nadir; zenith = {concrete_number(lidar.zenith):g} degrees",
+        )
+    yield Misfit(
+        config.uses_quadrature and not consists_of_planes(scene),
+        lambda: "it is for planes; the scene has more",
+    )
     # Orders that the user chose are followed whatever the albedo. A larger albedo may still need no more.
-    albedo = largest_albedo(optics)
-    if scope.automatic_orders and albedo > scope.albedo + 1e-3:
-        histories, n_channels = plan.config.keeps_histories, len(scatterers.channels)
-        needed = choose_orders(scene, optics, n_channels, plan.rtol, None, histories).count
-        if needed > plan.orders:
-            yield (
+    if scope.automatic_orders:
+        albedo, n_channels = largest_albedo(optics, xp), len(config.channels)
+        needs_more = calls_for_more_orders(
+            scene, optics, n_channels, plan.rtol, plan.orders, config.keeps_histories, xp
+        )
+
+        def few_orders() -> str:
+            needed = choose_orders(scene, optics, n_channels, plan.rtol, None, config.keeps_histories).count
+            return (
                 f"it follows {plan.orders} orders, for albedos up to {scope.albedo:.3g}; the scene has "
                 f"{albedo:.3g}, which calls for {needed}"
             )
 
+        yield Misfit((albedo > scope.albedo + 1e-3) & needs_more, few_orders)
 
-def _misfit_lengths(plan: Plan, lidar: Lidar, scene: Scene) -> Iterator[str]:
+
+def _misfit_lengths(plan: Plan, lidar: Lidar, scene: Scene, xp: Any) -> Iterator[Misfit]:
     """Yield misfits in the lengths of paths, and in the numbers of loop steps that they need."""
-    if plan.scope.from_sensor != lidar.has_sensor_position:
-        kinds = {True: "a lidar that is placed by its sensor", False: "a lidar with an altitude"}
-        yield f"it is for {kinds[plan.scope.from_sensor]}, and this is {kinds[lidar.has_sensor_position]}"
-    lengths, config, limits = PathLengths(lidar, scene), plan.config, plan.limits
+    kinds = {True: "a lidar that is placed by its sensor", False: "a lidar with an altitude"}
+    yield Misfit(
+        plan.scope.from_sensor != lidar.has_sensor_position,
+        lambda: f"it is for {kinds[plan.scope.from_sensor]}, and this is {kinds[lidar.has_sensor_position]}",
+    )
+    lengths, config, limits = PathLengths(lidar, scene, xp=xp), plan.config, plan.limits
+    yield Misfit(lengths.reaches_sensor, lambda: "the scene reaches up to the sensor")
     top = -0.5 * lengths.first_path
-    if top > limits.start_distance:
-        yield (
+    yield Misfit(
+        top > limits.start_distance,
+        lambda: (
             f"its rays start {limits.start_distance:g} m before the reference plane; the scene reaches to "
             f"{top:g} m"
-        )
+        ),
+    )
     # A plan's segments may be longer than any chord of this scene: then the chords decide, unless the plan's
     # own length, which cuts them no shorter, needs fewer steps.
     segment, chord = limits.max_segment, lengths.longest_chord
-    if chord < segment and lengths.max_ray_segments(chord) > config.max_ray_segments:
-        segment = chord
+    uses_chord = (chord < segment) & (lengths.max_ray_segments(chord) > config.max_ray_segments)
+    segment = xp.where(uses_chord, chord, segment)
     longest = limits.max_path + limits.start_distance
-    counts = {
-        "segments of a ray": (lengths.max_ray_segments(segment), config.max_ray_segments),
-        "voxels along a flight": (lengths.max_faces(longest), config.max_faces),
-    }
     # Loops of fixed length would end before the ray does, and lose its light.
-    for name, (needed, planned) in counts.items():
-        if needed > planned:
-            yield f"it allows for {planned} {name}; the scene may have {needed}"
+    for name, needed, planned in (
+        ("segments of a ray", lengths.max_ray_segments(segment), config.max_ray_segments),
+        ("voxels along a flight", lengths.max_faces(longest), config.max_faces),
+    ):
+        yield Misfit(
+            needed > planned,
+            lambda name=name, needed=needed, planned=planned: (
+                f"it allows for {planned} {name}; the scene may have {needed}"
+            ),
+        )
     flight = lengths.longest_flight(longest)
-    if flight > limits.max_flight * (1 + _ROUNDING):
-        yield f"it follows flights over {limits.max_flight:g} m; the scene calls for {flight:g} m"
+    yield Misfit(
+        flight > limits.max_flight * (1 + _ROUNDING),
+        lambda: f"it follows flights over {limits.max_flight:g} m; the scene calls for {flight:g} m",
+    )
 
 
-def _misfit_times(plan: Plan, lidar: Lidar, scene: Scene) -> Iterator[str]:
+def _misfit_times(plan: Plan, lidar: Lidar, scene: Scene, xp: Any) -> Iterator[Misfit]:
     """Yield misfits in the times at which light returns."""
-    lengths, bins, scope = PathLengths(lidar, scene), plan.bins, plan.scope
+    lengths, bins, scope = PathLengths(lidar, scene, xp=xp), plan.bins, plan.scope
     first, last = lengths.first_path / SPEED_OF_LIGHT, lengths.last_path / SPEED_OF_LIGHT
     begin, end = bins.start, plan.limits.max_path / SPEED_OF_LIGHT - bins.width
     if not scope.automatic_window:
         # What a window leaves out is the caller's choice, for scenes no larger than the plan's.
         begin, end = min(begin, scope.first_return), max(end, scope.last_return)
     slack = bins.width + _ROUNDING * max(abs(begin), abs(end))
-    if first < begin - slack or last > end + slack:
-        yield f"it covers returns from {begin:.6g} to {end:.6g} ns; the scene has {first:.6g} to {last:.6g}"
+    yield Misfit(
+        (first < begin - slack) | (last > end + slack),
+        lambda: (
+            f"it covers returns from {begin:.6g} to {end:.6g} ns; the scene has {first:.6g} to {last:.6g}"
+        ),
+    )
 
 
-def _misfit_pulse(plan: Plan, lidar: Lidar, scene: Scene) -> Iterator[str]:
+def _misfit_pulse(plan: Plan, lidar: Lidar, scene: Scene, xp: Any) -> Iterator[Misfit]:
     """Yield misfits in the pulse, and in its sampling."""
-    interval = concrete_number(lidar.sampling_interval)
-    if not lidar.opens_at_first_return and abs(plan.sample_interval - interval) > _ROUNDING * interval:
-        yield f"it has samples of {plan.sample_interval:g} ns; sampling_interval = {interval:g} ns"
-    jitter = concrete_number(lidar.jitter)
-    feature = math.hypot(concrete_number(lidar.pulse.finest), jitter)
-    planned_feature = plan.scope.pulse_feature
-    if feature < planned_feature * (1 - _ROUNDING):
-        yield (
+    interval = fixed_array(lidar.sampling_interval, xp)
+    if not lidar.opens_at_first_return:
+        yield Misfit(
+            abs(plan.sample_interval - interval) > _ROUNDING * interval,
+            lambda: f"it has samples of {plan.sample_interval:g} ns; sampling_interval = {interval:g} ns",
+        )
+    jitter = fixed_array(lidar.jitter, xp)
+    feature, planned_feature = xp.hypot(fixed_array(lidar.pulse.finest, xp), jitter), plan.scope.pulse_feature
+    yield Misfit(
+        feature < planned_feature * (1 - _ROUNDING),
+        lambda: (
             f"its fine bins suit pulses with features of {planned_feature:.3g} ns; the lidar's pulse has "
             f"some of {feature:.3g} ns"
-        )
+        ),
+    )
     # With a window of the user's, the part of the pulse that it cuts off is the user's choice.
-    low, high = lidar.pulse.support(jitter)
+    if not plan.scope.automatic_window:
+        return
     planned_low, planned_high = plan.pulse_support
+    pulse = lidar.pulse
+    try:
+        low, high = pulse.support(lidar.jitter)
+    except (jax.errors.ConcretizationTypeError, jax.errors.TracerArrayConversionError):
+        # A pulse whose support is known where its parameters are: what energy is outside of the plan's?
+        slack = plan.bins.width + _ROUNDING * (planned_high - planned_low)
+        ends = jnp.asarray([planned_low - slack, planned_high + slack])
+        inside = jnp.diff(pulse.cumulative(ends, lidar.jitter))[0]
+        yield Misfit(inside < 1 - _ROUNDING, lambda: "the lidar's pulse lasts longer")
+        return
     slack = plan.bins.width + _ROUNDING * (high - low)
-    if plan.scope.automatic_window and (low < planned_low - slack or high > planned_high + slack):
-        yield (
+    yield Misfit(
+        low < planned_low - slack or high > planned_high + slack,
+        lambda: (
             f"it is for a pulse from {planned_low:.4g} to {planned_high:.4g} ns; the lidar's lasts from "
             f"{low:.4g} to {high:.4g} ns"
-        )
+        ),
+    )
+
+
+_ALL_MISFITS = (_misfit_materials, _misfit_lengths, _misfit_times, _misfit_pulse)

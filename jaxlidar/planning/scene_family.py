@@ -80,7 +80,7 @@ def plan_scenes(
     """Make one plan that serves all scenes of a family: scenes of one structure with other values.
 
     Give the scenes at the bounds of the family, or a stack of all of them. Light that a scene returns outside
-    of the fine bins of the plan is in `lost` of its waveform.
+    of the fine bins of the plan is in `lost` of its waveform, which is 1 where the plan covers no such scene.
 
     **Arguments:**
 

@@ -6,7 +6,7 @@ from typing import final
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from jaxlidar._checks import check_kind, is_traced
 from jaxlidar._ranges import inadmissible
@@ -14,6 +14,7 @@ from jaxlidar.instrument.lidar import Lidar
 from jaxlidar.planning.effects import without_effects
 from jaxlidar.planning.local_origin import move_aim_to_origin
 from jaxlidar.planning.plan import Plan
+from jaxlidar.planning.plan_check import is_covered
 from jaxlidar.scenes.scene import Scene, check_kinds
 from jaxlidar.scenes.terrain import Terrain
 
@@ -30,6 +31,8 @@ class Setup(eqx.Module):
     - `plan`: a `Plan`.
     - `admissible`: a factor by which waveforms are multiplied: 1, or NaN where a traced value lies outside
       its range.
+    - `is_covered`: True, or False where the plan does not cover the traced lidar and scene: then
+      `Waveform.lost` is 1 at least.
 
     **Example:**
 
@@ -44,6 +47,11 @@ class Setup(eqx.Module):
     scene: Scene
     plan: Plan = eqx.field(static=True)
     admissible: Float[Array, ""]
+    is_covered: Bool[Array, ""]
+
+    def nan_unless_covered(self) -> Float[Array, ""]:
+        """Return a factor for results that do not have `lost`: `admissible`, and NaN where not covered."""
+        return jnp.where(self.is_covered, self.admissible, jnp.nan)
 
 
 def make_setup(lidar: Lidar, scene: Scene, plan: Plan) -> Setup:
@@ -56,7 +64,8 @@ def make_setup(lidar: Lidar, scene: Scene, plan: Plan) -> Setup:
     - `plan`: a `Plan` made by `jaxlidar.plan`.
 
     Within a JAX transformation values cannot be refused: waveforms are NaN where a traced value lies outside
-    the range that its class states. `jaxlidar.extend.reasons` says which.
+    the range that its class states. `jaxlidar.extend.reasons` says which. `Waveform.lost` is 1 where the plan
+    does not cover the lidar and the scene.
 
     **Returns:** a `Setup`.
 
@@ -96,7 +105,8 @@ def make_setup(lidar: Lidar, scene: Scene, plan: Plan) -> Setup:
             'transformation; make the plan with effects={"meshes": True}'
         )
     # A traced value cannot raise an error. NaN in all waveforms cannot be overlooked, and costs one product.
-    admissible = jnp.ones(())
+    admissible, covered = jnp.ones(()), jnp.asarray(True)
     if any(is_traced(x) for x in jax.tree.leaves((lidar, scene))):
         admissible = jnp.where(inadmissible((lidar, scene)), jnp.nan, admissible)
-    return Setup(*without_effects(*move_aim_to_origin(lidar, scene), plan.off), plan, admissible)
+        covered = is_covered(plan, lidar, scene)
+    return Setup(*without_effects(*move_aim_to_origin(lidar, scene), plan.off), plan, admissible, covered)

@@ -35,7 +35,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxlidar._checks import concrete_array
+from jaxlidar._checks import array_namespace, fixed_array
 from jaxlidar._mesh_axes import vary_together
 from jaxlidar._one_function import once
 from jaxlidar._vectors import FAR, Scalar, Vec, along, dot, normalise, vec, with_derivative_of
@@ -62,6 +62,8 @@ _COMPACTION_RATIO = 8
 _MIN_APPROACH_RATE = 1e-4
 # Components of directions below this, in cells per m or m per m, count as zero.
 _PARALLEL = 1e-12
+# Part of a cell by which the box of a beam is narrowed where its bounds are rounded to single precision.
+_CELL_SLACK = 1e-3
 
 
 class _Traversal(eqx.Module):
@@ -318,27 +320,35 @@ class HeightField(AbstractShape):
         return lax.while_loop(continue_, advance, vary_together(state))
 
     def height_bounds_below(
-        self, points: Float[np.ndarray, "n 3"], directions: Float[np.ndarray, "n 3"]
-    ) -> tuple[Float[np.ndarray, "2 2"], float, float]:
+        self, points: Float[np.ndarray | Array, "n 3"], directions: Float[np.ndarray | Array, "n 3"]
+    ) -> tuple[Float[np.ndarray | Array, "2 2"], Any, Any]:
         """Bound the surface that a beam can meet, all of whose rays lie among the given lines.
 
         **Returns:** (2, 2) the smallest and the largest x and y, m, at which rays may meet the surface, and
         the smallest and the largest height, m, in between.
         """
-        heights, spacing = concrete_array(self.heights.values), concrete_array(self.heights.spacing)
-        south_west = concrete_array(self.heights.origin) - concrete_array(self.heights.origin_node) * spacing
-        downward = np.minimum(directions[:, 2], -1e-9)
-        low, high, box = heights.min(), heights.max(), np.zeros((2, 2))
+        xp = array_namespace(points)
+        heights, spacing = fixed_array(self.heights.values, xp), fixed_array(self.heights.spacing, xp)
+        origin, origin_node = (fixed_array(a, xp) for a in (self.heights.origin, self.heights.origin_node))
+        south_west = origin - origin_node * spacing
+        downward = xp.minimum(directions[:, 2], -1e-9)
+        low, high, box = heights.min(), heights.max(), xp.zeros((2, 2))
+        # In single precision, rounding must not add cells.
+        slack = 0.0 if xp is np else _CELL_SLACK
         # Between two heights the lines stay within a box, within which the heights have closer bounds, and so
         # on.
         for _ in range(4):
             steps = [(z - points[:, 2]) / downward for z in (low, high)]
             # Coordinate by coordinate: NumPy reduces long rows many times faster than columns of two.
-            for k in range(2):
-                ends = [points[:, k] + directions[:, k] * step for step in steps]
-                box[:, k] = np.min(ends), np.max(ends)
-            first = np.floor((box[0] - south_west) / spacing).astype(int)
-            last = np.ceil((box[1] - south_west) / spacing).astype(int)
+            ends = [xp.stack([points[:, k] + directions[:, k] * step for step in steps]) for k in range(2)]
+            box = xp.stack([xp.stack([end.min() for end in ends]), xp.stack([end.max() for end in ends])])
+            first = xp.floor((box[0] - south_west) / spacing + slack).astype(int)
+            last = xp.ceil((box[1] - south_west) / spacing - slack).astype(int)
+            if xp is not np:
+                in_box = _touches_nodes(first, last, heights.shape, self.heights.periodic)
+                low = xp.where(in_box, heights, xp.inf).min()
+                high = xp.where(in_box, heights, -xp.inf).max()
+                continue
             indices = []
             for a, b, n in zip(first, last, heights.shape):
                 # The nodes of all cells that the box touches; in a periodic field, each node at most once.
@@ -346,16 +356,31 @@ class HeightField(AbstractShape):
                 indices.append(nodes % n if self.heights.periodic else np.unique(np.clip(nodes, 0, n - 1)))
             heights_in_box = heights[np.ix_(*indices)]
             low, high = heights_in_box.min(), heights_in_box.max()
-        return box, float(low), float(high)
+        return (box, float(low), float(high)) if xp is np else (box, low, high)
 
     def crossing(
-        self, points: Float[np.ndarray, "n 3"], directions: Float[np.ndarray, "n 3"]
-    ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+        self, points: Float[np.ndarray | Array, "n 3"], directions: Float[np.ndarray | Array, "n 3"]
+    ) -> tuple[Float[np.ndarray | Array, " n"], Float[np.ndarray | Array, " n"]]:
         _, low, high = self.height_bounds_below(points, directions)
         # Neighbouring lines take the extremes in turn, as the method of the base class asks for.
-        level = np.where(np.arange(len(points)) % 2, low, high)
-        downward = np.minimum(directions[:, 2], -1e-9)
+        xp = array_namespace(points)
+        level = xp.where(np.arange(len(points)) % 2, low, high)
+        downward = xp.minimum(directions[:, 2], -1e-9)
         return (level - points[:, 2]) / downward, downward
+
+
+def _touches_nodes(
+    first: Int[Array, "2"], last: Int[Array, "2"], shape: tuple[int, ...], periodic: bool
+) -> Bool[Array, "nx ny"]:
+    """Return True for the nodes between the first and the last along each axis, which may be traced."""
+    along_axes = []
+    for a, b, n in zip(first, last, shape):
+        nodes = jnp.arange(n)
+        if periodic:
+            along_axes.append((nodes - a) % n <= b - a)
+        else:
+            along_axes.append((nodes >= jnp.clip(a, 0, n - 1)) & (nodes <= jnp.clip(b, 0, n - 1)))
+    return along_axes[0][:, None] & along_axes[1]
 
 
 def _block_maxima(heights: Raster) -> Float[Array, "blocks_x blocks_y"]:

@@ -28,6 +28,7 @@ from jaxlidar._checks import (
     check_shape,
     concrete,
     concrete_array,
+    fixed_array,
     is_traced,
     kind_of,
 )
@@ -294,18 +295,22 @@ class MeshSurface(eqx.Module):
         placed = np.einsum("nij,vj->nvi", matrices, vertices) + concrete_array(places.shift)[:, None]
         return placed[:, faces].reshape(-1, 3, 3)
 
-    def bounds(self) -> Float[np.ndarray, "instances 2 3"]:
-        """Return the lowest and the highest corner, m, of a box around each instance.
+    def bounds(self, xp: Any = np) -> Any:
+        """Return the lowest and the highest corner, m, of a box around each instance, (instances, 2, 3).
 
-        **Raises:** ValueError where JAX is tracing the mesh or its instances.
+        `xp`: numpy or jax.numpy, with whose functions to compute. Default numpy.
+
+        **Raises:** ValueError where JAX is tracing the mesh or its instances, and `xp` is numpy.
         """
-        vertices = concrete_array(self.vertices)
+        vertices = fixed_array(self.vertices, xp)
         low, high = vertices.min(axis=0), vertices.max(axis=0)
         places = self.instances
-        matrices = _matrices(concrete_array(places.rotation), concrete_array(places.scale), np)
-        middle = matrices @ (0.5 * (low + high) + self.origin) + concrete_array(places.shift)
-        half = np.abs(matrices) @ (0.5 * (high - low))
-        return np.stack([middle - half, middle + half], axis=1)
+        matrices = _matrices(fixed_array(places.rotation, xp), fixed_array(places.scale, xp), xp)
+        # Products and sums in place of `@`, which some devices evaluate in half precision.
+        middle = (matrices * (0.5 * (low + high) + xp.asarray(self.origin, float))).sum(axis=2)
+        middle = middle + fixed_array(places.shift, xp)
+        half = (xp.abs(matrices) * (0.5 * (high - low))).sum(axis=2)
+        return xp.stack([middle - half, middle + half], axis=1)
 
 
 def _mesh_arrays(
@@ -559,8 +564,8 @@ class TriangleMesh(AbstractShape):
         return normal, dot(normal, x)
 
     def crossing(
-        self, points: Float[np.ndarray, "n 3"], directions: Float[np.ndarray, "n 3"]
-    ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+        self, points: Float[np.ndarray | Array, "n 3"], directions: Float[np.ndarray | Array, "n 3"]
+    ) -> tuple[Float[np.ndarray | Array, " n"], Float[np.ndarray | Array, " n"]]:
         boxes = np.concatenate([mesh.bounds() for mesh in self.meshes]) + concrete_array(self.offset)
         low, high = boxes[:, 0].min(axis=0), boxes[:, 1].max(axis=0)
         ahead = ((0.5 * (low + high) - points) * directions).sum(axis=1)

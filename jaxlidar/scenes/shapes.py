@@ -21,7 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from jaxlidar._checks import as_array, as_scalar, concrete_array
+from jaxlidar._checks import array_namespace, as_array, as_scalar, fixed_array
 from jaxlidar._vectors import FAR, Scalar, Vec, dot, vec
 
 # Rays whose cosine with the normal is smaller than this are taken as parallel and do not meet the plane.
@@ -93,13 +93,14 @@ class AbstractShape(eqx.Module):
 
     @abc.abstractmethod
     def crossing(
-        self, points: Float[np.ndarray, "n 3"], directions: Float[np.ndarray, "n 3"]
-    ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+        self, points: Float[np.ndarray | Array, "n 3"], directions: Float[np.ndarray | Array, "n 3"]
+    ) -> tuple[Float[np.ndarray | Array, " n"], Float[np.ndarray | Array, " n"]]:
         """Find the signed distances at which straight lines cross the surface, and the cosines of incidence.
 
         Plans use them, in double precision, to bound the lengths of all paths. A shape that is curved or
         bounded returns the smallest and the largest values that any line near the given ones can have, at
-        different elements of the arrays.
+        different elements of the arrays. Within a JAX transformation the arguments are JAX arrays; where a
+        shape of yours cannot take these, `Waveform.lost` does not tell that a plan starts below it.
 
         **Arguments:**
 
@@ -212,11 +213,13 @@ class Plane(AbstractShape):
         return vec(self.upward), jnp.sum(self.upward * self.foot)
 
     def crossing(
-        self, points: Float[np.ndarray, "n 3"], directions: Float[np.ndarray, "n 3"]
-    ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
-        normal, foot = concrete_array(self.upward), concrete_array(self.foot)
-        cosine = directions @ normal
-        return _signed_distance(normal @ foot - points @ normal, cosine, np), cosine
+        self, points: Float[np.ndarray | Array, "n 3"], directions: Float[np.ndarray | Array, "n 3"]
+    ) -> tuple[Float[np.ndarray | Array, " n"], Float[np.ndarray | Array, " n"]]:
+        xp = array_namespace(points)
+        normal, foot = fixed_array(self.upward, xp), fixed_array(self.foot, xp)
+        # Products and sums in place of `@`, which some devices evaluate in half precision.
+        cosine, height = (directions * normal).sum(axis=1), ((foot - points) * normal).sum(axis=1)
+        return _signed_distance(height, cosine, xp), cosine
 
 
 def _signed_distance(height: Any, cosine: Any, xp: Any = jnp) -> Any:

@@ -20,7 +20,7 @@ from typing import NamedTuple
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from jaxlidar._checks import as_array
 from jaxlidar._constants import SPEED_OF_LIGHT
@@ -60,7 +60,7 @@ class WaveformModel(eqx.Module):
     - `transmittance`: two-way, of the atmosphere, in fine bins. `air_return`: its own return, in samples;
       `air_relative_energy`: the relative energy of that (see `relative_energy_samples`). None where there is
       no atmosphere, or no return from it.
-    - `admissible`: a factor, 1 or NaN; see `Setup`.
+    - `admissible`: a factor, 1 or NaN; `is_covered`: True if the plan covers the scene; see `Setup`.
     - `lidar`: the lidar, with its spectrum.
     - `materials`: their names. `first_degree`, `degree`: of histories.
     - `one_order`: True if one order is followed. `can_scatter_again`: True if scattered light can meet the
@@ -78,6 +78,7 @@ class WaveformModel(eqx.Module):
     air_return: Float[Array, "wavelengths samples"] | None
     air_relative_energy: Float[Array, "wavelengths samples"] | None
     admissible: Float[Array, ""]
+    is_covered: Bool[Array, ""]
     lidar: Lidar
     materials: tuple[str, ...] = eqx.field(static=True)
     first_degree: int = eqx.field(static=True)
@@ -245,6 +246,7 @@ def _make_model(
         air_return=air_return,
         air_relative_energy=air_relative_energy,
         admissible=setup.admissible,
+        is_covered=setup.is_covered,
         lidar=lidar,
         materials=plan.config.materials,
         first_degree=plan.config.first_degree if plan.config.keeps_histories else 0,
@@ -534,7 +536,10 @@ def budget_of_sums(sums: ResponseSums, model: WaveformModel) -> BudgetTerms:
     # light has escaped to compare with, and the user left higher orders out: the estimate is zero.
     return_per_energy = sums.returned / jnp.maximum(budget["escaped"], 1e-6)
     unfollowed = jnp.zeros_like(sums.returned) if model.one_order else budget["unfollowed"]
-    return BudgetTerms(budget, unfollowed * jnp.clip(return_per_energy, 1.0, 4.0), sums.lost)
+    # What a plan that does not cover the scene leaves out is not known: all light of a white surface, and no
+    # less than what was found, as mirrors return more.
+    lost = jnp.where(model.is_covered, sums.lost, jnp.maximum(sums.returned + sums.lost, 1.0))
+    return BudgetTerms(budget, unfollowed * jnp.clip(return_per_energy, 1.0, 4.0), lost)
 
 
 def samples_and_budget(
