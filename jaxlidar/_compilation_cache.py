@@ -1,6 +1,8 @@
 """Cache of compiled programs on disk, for later sessions."""
 
+import hashlib
 import os
+import platform
 from collections.abc import Mapping
 from pathlib import Path
 from types import TracebackType
@@ -9,9 +11,6 @@ from typing import Any
 import jax
 import platformdirs
 from jax.experimental.compilation_cache import compilation_cache as jax_cache
-
-from jaxlidar._executables import ExecutableStore, processor_digest
-from jaxlidar._programs import use_store
 
 # Programs that compile faster than this, s, are not stored.
 MIN_COMPILE_TIME = 0.05
@@ -23,7 +22,15 @@ def default_folder() -> Path:
     Machines with different processors may share a home folder, and a program may use instructions that only
     some of them have.
     """
-    return platformdirs.user_cache_path("jaxlidar") / "programs" / processor_digest()
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:
+        lines = []
+    # "flags" on x86, "Features" on ARM.
+    features = next((line for line in lines if line.lower().startswith(("flags", "features"))), "")
+    processor = f"{platform.machine()} {platform.processor()} {features}"
+    digest = hashlib.sha256(processor.encode()).hexdigest()[:12]
+    return platformdirs.user_cache_path("jaxlidar") / "programs" / digest
 
 
 class CompilationCache:
@@ -44,15 +51,13 @@ class CompilationCache:
     folder: Path
 
     def __init__(self, folder: Path, previous: Mapping[str, Any]):
-        """Store executables in the folder. `previous`: settings of JAX to which `close` returns."""
-        self.folder, self._previous = folder, dict(previous)
-        self._previous_store, self._is_open = use_store(ExecutableStore(folder)), True
+        """`previous`: settings of JAX to which `close` returns."""
+        self.folder, self._previous, self._is_open = folder, dict(previous), True
 
     def close(self) -> None:
         """Give JAX back the settings that it had before; a second call does nothing."""
         if self._is_open:
             _configure(self._previous)
-            use_store(self._previous_store)
         self._is_open = False
 
     def __enter__(self) -> "CompilationCache":
@@ -71,10 +76,8 @@ def compilation_cache(folder: str | os.PathLike[str] | None = None) -> Compilati
     """Let JAX store compiled programs in a folder, and read them from there in later sessions.
 
     Call it once at the start of a session, or use it as a context. It switches on JAX's own persistent cache,
-    for programs of all packages. Programs of jaxlidar are stored as executables as well, which are loaded
-    without being traced again. Importing jaxlidar does neither. Programs depend on the releases of packages,
-    on the processor and on your own functions, and are not reused for others. Nothing is removed from the
-    folder.
+    for programs of all packages; importing jaxlidar does not. Programs are asked for once they have been
+    traced, so that a change of your own functions is seen. Nothing is removed from the folder.
 
     On a CPU, JAX before 0.11 logs an error for each program that it reads: XLA takes its own tuning options,
     "prefer-no-gather" and "prefer-no-scatter", for features that the processor lacks. It is harmless, and

@@ -13,28 +13,15 @@ import threading
 from collections import OrderedDict
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor, wait
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 
 from jaxlidar._checks import is_traced
-from jaxlidar._executables import ExecutableStore, noting_cache_hits
 
 # A compiled simulation takes 50 to 250 MB.
 MAX_VERSIONS = 16
-
-
-# Executables of earlier sessions; None unless `jaxlidar.compilation_cache` is in use.
-_store: ExecutableStore | None = None
-
-
-def use_store(store: ExecutableStore | None) -> ExecutableStore | None:
-    """Load programs from a store, and add new ones to it; or from none. **Returns:** the store before."""
-    global _store
-    previous, _store = _store, store
-    return previous
 
 
 class Program:
@@ -107,7 +94,7 @@ class Program:
         with self._lock:
             version = self.versions.get(key)
             if version is None:
-                version = _Version(self.function, static_parts, types, settings, self.options)
+                version = _Version(self.function, static_parts, self.options)
                 self.versions[key] = version
             self.versions.move_to_end(key)
             while len(self.versions) > self.max_versions:
@@ -181,15 +168,11 @@ class _Version:
         self,
         function: Callable,
         static_parts: dict[str | int, _StaticPart],
-        types: tuple[Any, ...],
-        settings: tuple[Any, ...],
         options: dict[str, Any],
     ):
-        """`types`: of the arrays of each argument. `settings`: of JAX. `options`: of `jax.jit`."""
+        """`options`: of `jax.jit`."""
         self._results: list[Any] = []
         self._lock = threading.Lock()
-        self.path: Path | None = None
-        self.identity = function, static_parts, types, settings, options
 
         # Not `self`: the version would be part of a cycle, and its program freed at the next collection of
         # garbage only, many programs later.
@@ -220,10 +203,6 @@ class _Version:
             with self._lock:
                 if self.compilation is not None:
                     wait([self.compilation])
-                elif _store is not None and not self.is_compiled and not self._load(_store):
-                    traced = self.compiled.trace(arrays)
-                    self.result_shapes = traced.out_info
-                    self._compile(traced.lower(), _store)
                 result_arrays = self.compiled(arrays)
                 self.is_compiled = True
         else:
@@ -232,48 +211,14 @@ class _Version:
 
     def compile_ahead(self, arrays: list[Any]) -> Any:
         with self._lock:
-            if self.result_shapes is None and (_store is None or not self._load(_store)):
+            if self.result_shapes is None:
                 # Tracing takes the caller's precision, which JAX keeps by thread; compiling needs it no more.
                 # JAX keeps what is compiled here, so that the call after it compiles nothing.
                 traced = self.compiled.trace(arrays)
                 self.result_shapes = traced.out_info
                 if not self.is_compiled:
-                    lowered = traced.lower()
-                    self.compilation = _compilation_threads().submit(self._compile, lowered, _store)
-        # Either loaded from the store or traced.
-        assert self.result_shapes is not None
+                    self.compilation = _compilation_threads().submit(traced.lower().compile)
         return _unflatten(self.result, iter(self.result_shapes))
-
-    def _compile(self, lowered: Any, store: ExecutableStore | None) -> None:
-        """Compile, and add the executable to the store."""
-        with noting_cache_hits() as hits:
-            compiled = lowered.compile()
-        # XLA writes an executable that it has read itself without machine code: it would fail when called.
-        if store is not None and self.path is not None and not hits:
-            shapes = [jax.ShapeDtypeStruct(shape.shape, shape.dtype) for shape in self.result_shapes]
-            store.save(self.path, compiled, _unflatten(self.result, iter(shapes)))
-
-    def _load(self, store: ExecutableStore) -> bool:
-        """Take the executable from the store. **Returns:** False if it has none."""
-        # Here, in the thread of the caller, whose precision the path depends on.
-        self.path = self._path_in(store)
-        stored = None if self.path is None else store.load(self.path)
-        if stored is None:
-            return False
-        flat_result = _flatten(stored.result)
-        self._results[:], self.result_shapes = [flat_result.static], flat_result.arrays
-        self.compiled, self.is_compiled = stored.call, True
-        return True
-
-    def _path_in(self, store: ExecutableStore) -> Path | None:
-        function, static_parts, types, settings, options = self.identity
-        # The arguments themselves, with types in place of arrays: structures of JAX have no digest.
-        arguments = {
-            name: _unflatten(static, iter([(shape, str(dtype), weak) for shape, dtype, weak in array_types]))
-            for (name, static), array_types in zip(static_parts.items(), types)
-        }
-        parts = {"function": function, "arguments": arguments, "options": options}
-        return store.path_of(function.__name__, settings=list(map(str, settings)), **parts)
 
 
 @functools.cache
