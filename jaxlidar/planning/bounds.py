@@ -472,7 +472,7 @@ class Bounds:
     def _distance(self, surface: AbstractSurface, rays: Rays) -> PerRay:
         """Distance, m, from the sensor at which rays meet a surface."""
         sensor = np.append(concrete_array(self.lidar.position), 0.0) - self.slant_range * self.beam_axis
-        return surface.shape.crossing(np.broadcast_to(sensor, rays.shape), rays)[0]
+        return np.asarray(surface.shape.crossing(np.broadcast_to(sensor, rays.shape), rays)[0])
 
     def _half_pulse_variation(self) -> float:
         """Half the total variation of the pulse's power, 1/ns; for a pulse with one peak, the peak power."""

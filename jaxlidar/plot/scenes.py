@@ -182,4 +182,4 @@ def _heights_at(surface: AbstractSurface, sides: np.ndarray, across: int, middle
     points = np.full((2, 3), middle)
     points[:, across], points[:, 2] = sides, 0.0
     depth, _ = surface.shape.crossing(points, np.tile([0.0, 0.0, -1.0], (2, 1)))
-    return -depth
+    return -np.asarray(depth)

@@ -26,6 +26,9 @@ included; where they do not, the integrand must be continuous. For higher orders
   end in the medium must not take part in the motion of landings: they would carry a response that is not
   zero across this border, and across the direction in which a surface ends.
 - The horizon of a surface: the density of landings, proportional to the cosine, falls to zero there.
+- Triangles beneath voxels: landings there keep their direction, and cross from column to column: not covered.
+- Surfaces within a voxel of the medium: collisions keep their fraction of its whole chord, on which the surface
+  moves: not covered.
 - The outlines of shapes and of meshes, and ridges that hide what lies behind them: not covered in higher
   orders; derivatives lack the light that appears and disappears there.
 

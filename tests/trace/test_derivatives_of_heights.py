@@ -1,4 +1,4 @@
-"""Derivatives of the orders two and above with respect to what moves: ground, canopy, plates, terrain, mesh.
+"""Derivatives of the orders two and above with respect to what moves: ground, canopy, plates, terrain.
 
 The first order is left out: its shift in time is so much larger that it hides what the others lack. The
 canopy is several columns wide, so that photons cross faces and leave by the sides, and the functionals are
@@ -64,13 +64,6 @@ def plate(height, coverage=0.5):
     return jl.Plate(height=height, reflectance=0.3, transmittance=0.3, coverage=coverage)
 
 
-def sheet(height):
-    """Return a mesh that is larger than the scene: none of its edges is met."""
-    corners = np.array([[-300.0, -300.0], [300.0, -300.0], [300.0, 300.0], [-300.0, 300.0]])
-    vertices = jnp.concatenate([jnp.asarray(corners), jnp.broadcast_to(height, (4, 1))], axis=1)
-    return jl.MeshSurface(jl.TriangleMesh(vertices, [[0, 1, 2], [0, 2, 3]]), reflectance=0.25)
-
-
 def scene(floor, canopy=None, **surfaces):
     return jl.Scene(canopy=canopy, ground=floor, **surfaces)
 
@@ -108,13 +101,6 @@ CASES = {
         0.5,
         0.25,
         4,
-    ),
-    "all vertices of a mesh": (
-        lidar(),
-        lambda h: scene(None, canopy(), meshes=(sheet(h),)),
-        0.0,
-        0.25,
-        3,
     ),
     "all voxels up": (lidar(), lambda h: scene(ground(), canopy(rise=h)), 0.0, 0.25, 4),
     "all layers up": (lidar(), layers, 0.0, 0.25, 4),
