@@ -27,8 +27,8 @@ included; where they do not, the integrand must be continuous. For higher orders
   zero across this border, and across the direction in which a surface ends.
 - The horizon of a surface: the density of landings, proportional to the cosine, falls to zero there.
 - Triangles beneath voxels: landings there keep their direction, and cross from column to column: not covered.
-- Surfaces within a voxel of the medium: collisions keep their fraction of its whole chord, on which the surface
-  moves: not covered.
+- Surfaces within a voxel: collisions keep their fraction of its whole chord, on which the surface moves: not
+  covered.
 - The outlines of shapes and of meshes, and ridges that hide what lies behind them: not covered in higher
   orders; derivatives lack the light that appears and disappears there.
 
