@@ -32,6 +32,7 @@ CHOSEN = {
     "hectare": 1,
     "strip": 3,
     "neural_posterior": 0,
+    "own_loss": 0,
     "recorded_shots": 0,
     "gedi_file": 0,
     "photon_track": 1,

@@ -12,6 +12,8 @@ import pytest
 EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
 FOLDER = EXAMPLES / "notebooks"
 NAMES = sorted(p.stem for p in FOLDER.glob("*.ipynb"))
+# Packages of the extra "bayes", by notebook.
+NEEDS = {"neural_posterior": "flowjax", "own_loss": "blackjax"}
 
 
 def all_cells(name):
@@ -44,8 +46,8 @@ def test_notebooks_are_short_and_say_what_to_change(name):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
 def test_code_runs(name, monkeypatch):
-    if name == "neural_posterior":
-        pytest.importorskip("flowjax", reason="flowjax is not installed: pip install '.[bayes]'")
+    if name in NEEDS:
+        pytest.importorskip(NEEDS[name], reason=f"{NEEDS[name]} is not installed: pip install '.[bayes]'")
     for variable in ("GEDI_L1B", "GEDI_L2A", "ATL03", "ATL08"):
         monkeypatch.delenv(variable, raising=False)
     before = matplotlib.get_backend()
@@ -69,6 +71,7 @@ def test_there_are_notebooks():
         "hectare",
         "leaf_traits",
         "neural_posterior",
+        "own_loss",
         "peak_detectors",
         "photon_track",
         "recorded_shots",
