@@ -7,8 +7,9 @@ A flight ends at the nearest of: a collision in the medium, at the optical depth
 a surface that stops the photon (the ground; a plate unless the photon passes a gap, or is transmitted
 straight on); the length beyond which its light could not be recorded any more; or it leaves the scene.
 
-Derivatives: the collision point is held at a fixed fraction of its chord through the voxel (detached), so
-that it moves with voxel sizes and heights, and the weight carries the attached ratio of its density
+Derivatives: the collision point is held at a fixed fraction of its chord through the voxel (detached), or of
+the part of it between surfaces that the path meets within the voxel, so that it moves with voxel sizes and
+heights, and stays on its side of a surface. The weight carries the attached ratio of its density
 
     p(s) ds = k exp(-tau) ds  ->  (k and exp(-tau) and the chord, each over its detached value).
 
@@ -136,19 +137,21 @@ def meet_surfaces(scene: DeviceScene, p: Photons, draws: tuple[Scalar, ...]) -> 
 def sample_flights(
     scene: DeviceScene,
     p: Photons,
-    nearest_stop: Float[Array, "photons"],
+    encounters: SurfaceEncounters,
     max_length: Float[Array, "photons"],
     u: Float[Array, "ends photons"],
 ) -> Flight:
-    """Let photons fly to collisions at the optical depths -ln(u), to a surface at `nearest_stop`, or on.
+    """Let photons fly to collisions at the optical depths -ln(u), to the surface that stops them, or on.
 
     A flight has one end for each number in `u`; `max_length`, m, is how far it can be recorded. The steps:
 
     1. March to the target depths, at most to the nearest stop or to `max_length`.
-    2. Place each collision within its voxel, where the depth is linear, at a detached fraction of the chord.
-    3. Attach the ratio of its density: exp(-tau) times the chord.
+    2. Place each collision within its voxel, where the depth is linear, at a detached fraction of the chord
+       between the surfaces on either side.
+    3. Attach the ratio of its density: exp(-tau) times that chord.
     4. Sort out what ended the flight.
     """
+    nearest_stop = encounters.nearest_stop
     # Nothing beyond these two can be an end: the march need not go there.
     max_distance = jnp.minimum(nearest_stop, max_length)
     to_ends = functools.partial(jnp.broadcast_to, shape=u.shape)
@@ -176,13 +179,24 @@ def sample_flights(
         chord = jnp.where(collided, crossing.chord, 1.0)
         # Guards against 0/0 where a voxel is empty or the chord zero.
         fraction = jnp.clip((target - crossing.depth) / jnp.maximum(k * chord, 1e-30), 0.0, 1.0)
-        # Held fixed as a fraction, the point stays within its voxel when voxels move or grow.
-        fraction = detach(jnp.where(collided, fraction, 0.0))
-        depth = jnp.where(collided, crossing.depth + fraction * k * chord, to_ends(crossing.total_depth))
-        distance = jnp.where(collided, crossing.entered + fraction * chord, to_ends(max_distance))
-        # The density per m is k exp(-tau), and the point moves with its chord: exp(-tau) and the chord are
+        flown = detach(jnp.where(collided, fraction, 0.0)) * chord
+        distance = jnp.where(collided, crossing.entered + flown, to_ends(max_distance))
+        # Held fixed as a fraction, the point stays within its voxel, and on its side of surfaces in it, when
+        # these move or grow: returns jump at them, and flights that are stopped end there.
+        nearest, farthest = crossing.entered, crossing.entered + chord
+        for surface_distance in map(to_ends, encounters.distances):
+            is_ahead = detach(surface_distance) > detach(distance)
+            farthest = jnp.where(is_ahead, jnp.minimum(farthest, surface_distance), farthest)
+            nearest = jnp.where(is_ahead, nearest, jnp.maximum(nearest, surface_distance))
+        span = jnp.where(collided, farthest - nearest, 1.0)
+        fraction = detach((distance - nearest) / jnp.maximum(span, 1e-30))
+        moved = jnp.where(collided, nearest + fraction * span, distance)
+        distance = with_derivative_of(distance, moved)
+        depth = crossing.depth + k * (distance - crossing.entered)
+        depth = jnp.where(collided, depth, to_ends(crossing.total_depth))
+        # The density per m is k exp(-tau), and the point moves with its span: exp(-tau) and the span are
         # attached here, k with the material that is hit.
-        ratio = jnp.exp(detach(depth) - depth) * chord / detach(chord)
+        ratio = jnp.exp(detach(depth) - depth) * span / jnp.maximum(detach(span), 1e-30)
         # Exactly one: rounding of the quotient would make waveforms depend on whether derivatives are taken.
         ratio = with_derivative_of(jnp.ones_like(ratio), ratio)
         # The march may also end at the box of occupied voxels, behind which there is nothing.

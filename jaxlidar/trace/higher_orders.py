@@ -441,7 +441,7 @@ def fly(
     strata = jnp.stack([(i + (draws.flight * ends - selected)) / ends for i in range(ends)])
     # The logarithm of zero would be an infinite depth: depths end at -ln(1e-9) = 20.7.
     u = jnp.maximum(strata, 1e-9)
-    flights = sample_flights(scene, p, encounters.nearest_stop, max_length, u)
+    flights = sample_flights(scene, p, encounters, max_length, u)
     # Rays of the first order move already (`rays_with_grids`).
     if has_moving_landings(scene):
         flights = move_landings(scene, p, encounters, flights, order > 0)

@@ -52,7 +52,7 @@ def fly_once(
     uniform = jax.random.uniform(key, shape, p.weight.dtype, tiny)
     draws = PhotonDraws.from_numbers(list(uniform), scene.n_plates)
     encounters = meet_surfaces(scene, p, draws.plates_ahead)
-    flights = sample_flights(scene, p, encounters.nearest_stop, max_length, draws.flight[None])
+    flights = sample_flights(scene, p, encounters, max_length, draws.flight[None])
     return draws, encounters, jax.tree.map(lambda a: a[0], flights)
 
 

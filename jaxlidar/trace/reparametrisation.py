@@ -17,18 +17,15 @@ surface (`move_landings`).
 Points must move with **every** border at which the integrand jumps, those of the domain of integration
 included; where they do not, the integrand must be continuous. For higher orders these are:
 
-- Collisions in the medium do not move: their direction is fixed, and so is the fraction of the chord at which
-  they lie within their voxel (`jaxlidar.trace.flight`). Where a path enters or leaves a voxel its chord grows
-  from zero, so that nothing jumps there.
+- Collisions in the medium keep their direction, and the fraction at which they lie between the ends of the
+  chord through their voxel, or surfaces that cut it (`jaxlidar.trace.flight`). Where a path comes to enter a
+  voxel its chord grows from zero, so that nothing jumps there.
 - Faces of columns and edges of terrain cells, for landings: points there move with them. The sides of a voxel
   map and the edges of terrain are such faces, too.
 - The longest flight: beyond it nothing is recorded, and the response has fallen to zero before. Photons that
   end in the medium must not take part in the motion of landings: they would carry a response that is not
   zero across this border, and across the direction in which a surface ends.
 - The horizon of a surface: the density of landings, proportional to the cosine, falls to zero there.
-- Triangles beneath voxels: landings there keep their direction, and cross from column to column: not covered.
-- Surfaces within a voxel: collisions keep their fraction of its whole chord, on which the surface moves: not
-  covered.
 - The outlines of shapes and of meshes, and ridges that hide what lies behind them: not covered in higher
   orders; derivatives lack the light that appears and disappears there.
 
@@ -85,12 +82,14 @@ from jaxlidar.trace.voxel_traversal import march_to_depths
 
 # Widths of columns or cells, and the position of one of their corners, m.
 Grid = tuple[Float[Array, "2"], Float[Array, "2"]]
-# A surface, and True for the photons that land on it.
-Target = tuple[AbstractShape, Bool[Array, "photons"]]
+# A surface, as its shape or as the tangent plane of each photon, and True for the photons that land on it.
+Target = tuple[AbstractShape | tuple[Vec, Scalar], Bool[Array, "photons"]]
 
 # Faces of two grids that are nearer than this fraction of a cell are taken as one: the density of points
 # between them would change by its inverse.
 _COINCIDENT = 1e-3
+# Least vertical component of the normal of triangles on which landing points move with columns.
+_MIN_UPRIGHT = 0.1
 # Radius of a beam, m, below which it is a line.
 _MIN_RADIUS = 1e-6
 # Distance from an outline, in radii of the beam, at which its motion and that of the ground weigh the same.
@@ -137,27 +136,27 @@ def move_landings(
     """
     assert p.last_scattering is not None
     moves = may_move & p.alive & jnp.any(flights.landed, axis=0)
-    targets = []
+    direct = along(p.x, p.w, jnp.where(moves, encounters.nearest_stop, 1.0))
+    landing, triangle = jax.tree.map(detach, direct), encounters.mesh_normal
+    targets: list[Target] = []
     for surface, stop in zip(scene.surfaces, encounters.stops):
         is_target = stop <= encounters.nearest_stop
         if surface.shape is None:
-            # A triangle may be vertical: it has no landing point for each column.
-            moves &= ~is_target
+            assert triangle is not None
+            # Points of a vertical triangle have no place of their own on the map.
+            moves &= ~is_target | (jnp.abs(detach(triangle[2])) > _MIN_UPRIGHT)
+            targets.append(((triangle, dot(triangle, direct)), is_target))
         else:
             targets.append((surface.shape, is_target))
 
     def tangent(targets: list[Target], point: Vec) -> tuple[Vec, Scalar]:
         offset = jnp.zeros_like(p.weight)
         normal = (offset, offset, jnp.ones_like(offset))
-        for shape, is_target in targets:
-            shape_normal, shape_offset = shape.tangent(point)
-            normal = vec(jnp.where(is_target & moves, n, m) for n, m in zip(shape_normal, normal))
-            offset = jnp.where(is_target & moves, shape_offset, offset)
+        for surface, is_target in targets:
+            plane = surface if isinstance(surface, tuple) else surface.tangent(point)
+            normal = vec(jnp.where(is_target & moves, n, m) for n, m in zip(plane[0], normal))
+            offset = jnp.where(is_target & moves, plane[1], offset)
         return normal, offset
-
-    distance = jnp.where(moves, encounters.nearest_stop, 1.0)
-    direct = along(p.x, p.w, distance)
-    landing = jax.tree.map(detach, direct)
 
     (x, y), widths = _between_faces(_grids(scene), landing)
     normal, offset = tangent(targets, (x, y, landing[2]))

@@ -1,4 +1,4 @@
-"""Derivatives of the orders two and above with respect to what moves: ground, canopy, plates, terrain.
+"""Derivatives of the orders two and above with respect to what moves: ground, canopy, plates, terrain, mesh.
 
 The first order is left out: its shift in time is so much larger that it hides what the others lack. The
 canopy is several columns wide, so that photons cross faces and leave by the sides, and the functionals are
@@ -64,6 +64,16 @@ def plate(height, coverage=0.5):
     return jl.Plate(height=height, reflectance=0.3, transmittance=0.3, coverage=coverage)
 
 
+def sheet(height):
+    """Return a mesh whose outlines no light meets."""
+    corners = np.array(
+        [[-300.0, -300.0, 0.0], [300.0, -300.0, 0.0], [300.0, 300.0, 0.0], [-300.0, 300.0, 0.0]]
+    )
+    mesh = jl.MeshSurface((corners, np.array([[0, 1, 2], [0, 2, 3]])), 0.25)
+    up = jnp.stack([jnp.zeros(4), jnp.zeros(4), jnp.broadcast_to(height, (4,))], axis=1)
+    return eqx.tree_at(lambda m: m.vertices, mesh, mesh.vertices + up)
+
+
 def scene(floor, canopy=None, **surfaces):
     return jl.Scene(canopy=canopy, ground=floor, **surfaces)
 
@@ -95,6 +105,31 @@ CASES = {
         0.25,
         4,
     ),
+    "plate within the canopy": (
+        lidar(),
+        lambda h: scene(ground(-1.0), canopy(), plates=(plate(h),)),
+        5.0,
+        0.25,
+        3,
+    ),
+    "slope of a plate within the canopy": (
+        lidar(),
+        lambda a: scene(
+            ground(-1.0),
+            canopy(),
+            plates=(jl.Plate(height=5.0, reflectance=0.3, transmittance=0.3, coverage=0.5, slope=a),),
+        ),
+        4.0,
+        2.0,
+        3,
+    ),
+    "nodes of terrain within voxels": (
+        lidar(),
+        lambda h: scene(terrain(h, RELIEF + 3.0), canopy()),
+        0.0,
+        0.1,
+        3,
+    ),
     "both plates": (
         lidar(),
         lambda h: scene(ground(-1.0), canopy(), plates=(plate(h + 0.7), plate(h))),
@@ -102,6 +137,8 @@ CASES = {
         0.25,
         4,
     ),
+    "all vertices of a mesh": (lidar(), lambda h: scene(None, canopy(), meshes=(sheet(h),)), 0.0, 0.25, 3),
+    "mesh within voxels": (lidar(), lambda h: scene(None, canopy(), meshes=(sheet(h),)), 3.0, 0.25, 3),
     "all voxels up": (lidar(), lambda h: scene(ground(), canopy(rise=h)), 0.0, 0.25, 4),
     "all layers up": (lidar(), layers, 0.0, 0.25, 4),
     "size of voxels in z": (lidar(), lambda s: scene(ground(), canopy(stretch=s)), 1.0, 0.1, 4),
@@ -160,6 +197,7 @@ def z_scores(exact, difference):
 BOUND = norm.isf(0.5 * (1 - 0.999**0.5))
 
 
+@pytest.mark.filterwarnings("ignore:.*outlines and edges of the mesh")
 @pytest.mark.parametrize("name", slow_unless(CHOSEN, CASES))
 def test_derivatives_agree_with_differences(name):
     z = z_scores(*derivatives(name))
