@@ -177,7 +177,11 @@ class LogDensity(eqx.Module):
     # Compiled as a method: arrays of the density are arguments, and many densities share one program.
     @eqx.filter_jit
     def __call__(self, x: Float[Array, "..."]) -> Float[Array, ""]:
-        """Return the log-density at unconstrained coordinates, -inf where the simulation is not finite.
+        """Return the log-density at unconstrained coordinates, -inf where the scene cannot be simulated.
+
+        That is where a value is inadmissible, such as a leaf that reflects more light than reaches it, where
+        the scene is larger than the plan is for, and where the simulation is not finite. Gradients are zero
+        in the first two cases.
 
         **Arguments:** `x`: (n,) coordinates, in the order of `names`.
 
@@ -188,10 +192,15 @@ class LogDensity(eqx.Module):
         x = self._checked(x)
         if x.ndim != 1:
             raise ValueError(f"x has the shape {x.shape}; admissible is ({len(self.names)},): use jax.vmap")
+        n_scene = self._prior_centre.size
+        scene_values = self._natural(x)[:n_scene]
+        simulation = self._simulation
+        can_simulate = simulation.inputs.can_simulate(split_values(scene_values, simulation.shapes))
+        # Simulate the start instead: derivatives of what is not finite would be NaN although it is not used.
+        x = jnp.where(can_simulate, x, self.initial)
         natural = self._natural(x)
         # d x / d u, over the width of the bounds, which is a constant.
         log_jacobian = jnp.sum(jax.nn.log_sigmoid(x) + jax.nn.log_sigmoid(-x))
-        n_scene = self._prior_centre.size
         scene_values, recorder_values = natural[:n_scene], natural[n_scene:]
         record, scale = self._reflectance(scene_values), 1.0
         if self._recorder is not None:
@@ -199,7 +208,7 @@ class LogDensity(eqx.Module):
             scale = self._recorder.scale_of(recorder_values)
         total = self._noise.log_likelihood(record, scale) + self._log_prior(scene_values) + log_jacobian
         # Samplers reject a point of density zero; NaN would stop them.
-        return jnp.where(jnp.isfinite(total), total, -jnp.inf)
+        return jnp.where(can_simulate & jnp.isfinite(total), total, -jnp.inf)
 
     def to_natural(self, x: Float[ArrayLike, "... n"]) -> dict[str, Float[Array, "..."]]:
         """Return values of the unknowns, in their own units and by name, from unconstrained coordinates.

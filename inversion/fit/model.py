@@ -55,6 +55,7 @@ from jaxlidar import (
 )
 from jaxlidar.extend import ONE_CORE, concrete, side_by_side
 from jaxlidar.planning.memory import format_bytes, memory_limit, scored_bytes
+from jaxlidar.planning.plan_check import is_in_reach
 from jaxlidar.spectral.apply_optics import derivatives_to_samples, make_waveform_model, setup_optics
 from jaxlidar.trace.device_scene import build_device_scene
 from jaxlidar.trace.extinction_slopes import ExtinctionSlopes
@@ -213,8 +214,16 @@ class SimulationInputs(eqx.Module):
 
     def setup(self, values: Values) -> Setup:
         """Return the setup with these values."""
+        return make_setup(*self._with_values(values), self.plan)
+
+    def can_simulate(self, values: Values) -> Bool[Array, ""]:
+        """Return True if these values are admissible and the plan has the path lengths of their scene."""
+        is_admissible = jnp.isfinite(self.setup(values).admissible)
+        return is_admissible & is_in_reach(self.plan, *self._with_values(values))
+
+    def _with_values(self, values: Values) -> tuple[Lidar, Scene]:
         lidar = set_lidar_values(self.lidar, self.setters, values)
-        return make_setup(lidar, set_values(self.scene, self.setters, values), self.plan)
+        return lidar, set_values(self.scene, self.setters, values)
 
     def as_function_of(
         self, dependence: Dependence, values: Values

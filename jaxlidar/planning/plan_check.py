@@ -73,12 +73,24 @@ def is_covered(plan: Plan, lidar: Lidar, scene: Scene) -> Bool[Array, ""]:
 
     Computed without derivatives, in single precision, whose rounding counts as covered.
     """
+    return _is_free_of(_ALL_MISFITS, plan, lidar, scene)
+
+
+def is_in_reach(plan: Plan, lidar: Lidar, scene: Scene) -> Bool[Array, ""]:
+    """Return True if a plan has the path lengths of a lidar and a scene that JAX is tracing.
+
+    As `is_covered`, whatever the materials, their albedos, the pulse and recorded times.
+    """
+    return _is_free_of((_misfit_lengths,), plan, lidar, scene)
+
+
+def _is_free_of(checks: Sequence[Callable], plan: Plan, lidar: Lidar, scene: Scene) -> Bool[Array, ""]:
     arrays, static = eqx.partition((lidar, scene), eqx.is_array)
     arrays = jax.tree.map(jax.lax.stop_gradient, arrays)
     # NumPy's rules of broadcasting, by which both evaluate.
     with jax.numpy_rank_promotion("allow"):
         lidar, scene = eqx.combine(arrays, static)
-        misfits = _misfits(plan, lidar, scene, _ALL_MISFITS, jnp)
+        misfits = _misfits(plan, lidar, scene, checks, jnp)
         return ~jnp.any(jnp.stack([jnp.asarray(misfit.is_present) for misfit in misfits]))
 
 

@@ -171,7 +171,44 @@ def test_a_scene_out_of_range_has_no_density():
     options = {"noise": 1e-3, "time": time, "key": jax.random.key(1), "max_orders": 1, "n_rays": 64}
     density = inversion.log_density(observed, LIDAR, stand(), [unknown], **options)
     assert np.isfinite(density(density.initial))
-    assert float(density(density.to_unconstrained({"leaf": 0.8}))) == -np.inf
+    value, gradient = jax.value_and_grad(density)(density.to_unconstrained({"leaf": 0.8}))
+    assert float(value) == -np.inf
+    np.testing.assert_array_equal(gradient, 0.0)
+
+
+@pytest.mark.parametrize(
+    "scene", [ground(), pytest.param(stand(), marks=pytest.mark.slow)], ids=["ground", "stand"]
+)
+def test_a_scene_that_the_plan_does_not_reach_has_no_density(scene):
+    observed, time = noisy_record(scene, 1e-3)
+
+    def bulge(scene, x):
+        return eqx.tree_at(lambda s: s.ground.height, scene, 0.2 + 8.0 * jnp.sin(jnp.pi * x))
+
+    # The plan serves the start and both bounds; between them the ground rises above the start of its rays.
+    unknown = Unknown(apply=bulge, bounds=(0.0, 1.0), start=0.01, name="bulge")
+    options = {"noise": 1e-3, "time": time, "key": jax.random.key(1), "max_orders": 1, "n_rays": 64}
+    density = inversion.log_density(observed, LIDAR, scene, [unknown], **options)
+    x = density.to_unconstrained({"bulge": np.array([0.01, 0.5, 0.99])})
+    values, gradients = jax.vmap(jax.value_and_grad(density))(x)
+    assert np.isfinite(values).tolist() == [True, False, True]
+    assert float(values[1]) == -np.inf
+    np.testing.assert_array_equal(gradients[1], 0.0)
+    assert np.all(np.isfinite(gradients))
+    assert np.all(gradients[::2] != 0.0)
+
+
+def test_optics_brighter_than_the_start_have_a_density():
+    """Orders are those that the start calls for: values that call for more keep their density."""
+    observed, time = noisy_record(stand(), 1e-3)
+    unknowns = [
+        Unknown("canopy.leaf.reflectance", bounds=(0.05, 0.6), start=0.06, name="leaf"),
+        Unknown("ground.height", bounds=(-1.0, 1.0), name="height"),
+    ]
+    options = {"noise": 1e-3, "time": time, "key": jax.random.key(1), "n_photons": 64, "n_rays": 64}
+    density = inversion.log_density(observed, LIDAR, stand(), unknowns, **options)
+    corners = density.to_unconstrained({"leaf": np.array([0.059, 0.59]), "height": np.array([-0.99, 0.99])})
+    assert np.all(np.isfinite(jax.vmap(density)(corners)))
 
 
 def test_a_smoothness_prior_without_strength_is_refused():
