@@ -251,17 +251,23 @@ def far_lidar(stretch=0.0):
 
 @pytest.mark.parametrize("name", slow_unless(["plane"], ["plane", "relief", "plate"]))
 def test_ground_and_canopy_that_rise_together_shift_time(name):
-    """Of parallel light from far away, path by path: d sum = 0, d moment = -(2 / c) sum."""
+    """Of parallel light from far away, path by path: d sum = 0, d moment = -(2 / c) sum.
+
+    Over planes the canopy repeats without end: light that leaves one by its sides comes back so late that
+    what the end of the record cuts off would show, by 0.1 %.
+    """
+    # Terrain ends, and the canopy with it.
+    sides, tolerance = ("open", 1e-3) if name == "relief" else ("periodic", 1e-5)
 
     def scene_of(h):
         floor = terrain(h, RELIEF) if name == "relief" else ground(h)
         plates = (plate(h + 0.7),) if name == "plate" else ()
-        return scene(floor, canopy(rise=h), plates=plates)
+        return scene(floor, canopy(rise=h, sides=sides), plates=plates)
 
     values, slopes = along_zero(lambda h: far_lidar(), scene_of)
     assert np.abs(slopes[0, 0]) < 1e-4 * values[0, 0]
     shift = -2.0 / jl.SPEED_OF_LIGHT / 20.0
-    assert slopes[0, 1] == pytest.approx(shift * values[0, 0], rel=1e-3)
+    assert slopes[0, 1] == pytest.approx(shift * values[0, 0], rel=tolerance)
 
 
 @pytest.mark.slow
