@@ -35,7 +35,6 @@ Modular Implicit Differentiation, NeurIPS 35.
 
 import dataclasses
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -55,7 +54,7 @@ from inversion.fit.result import Retrieval
 from inversion.fit.solver import fit_range, held_by_bounds
 from inversion.fit.unknowns import BoundUnknown, Setter, flat_bounds, set_values, split_values
 from jaxlidar import Plan, Waveform, total_reflectance, trace_scene
-from jaxlidar.extend import tensordot
+from jaxlidar.extend import side_by_side, tensordot
 
 # Added to the diagonal of H in widths of the bounds, as a fraction of its trace: undetermined unknowns stay
 # where they are.
@@ -336,15 +335,10 @@ def differentiable_retrieval(
 def _untraced(fit: Callable[[FitInputs], Any], inputs: FitInputs) -> Any:
     """Return `fit(inputs)`, of whose constants JAX traces none."""
     # While `jax.vjp` linearises a function, it traces what is converted to an array, whatever is asked of it.
-    # Traces, and the precision in force, are those of a thread.
-    is_double = jax.config.jax_enable_x64
-
-    def in_same_precision() -> Any:
-        with jax.enable_x64(is_double):
-            return fit(inputs)
-
-    with ThreadPoolExecutor(1) as thread:
-        return thread.submit(in_same_precision).result()
+    # Traces are those of a thread.
+    with side_by_side(1) as run:
+        (completed,) = run(fit, [inputs])
+    return completed
 
 
 def _as_array(x: Any, shape: tuple[int, ...]) -> Array:
