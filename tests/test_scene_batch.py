@@ -97,6 +97,30 @@ def test_the_plan_of_a_stack_serves_all_of_its_scenes():
         check_plan(by_one, LIDAR, corners[-1])
 
 
+def test_layers_of_the_tallest_scene_count_for_the_segments_of_a_ray():
+    def layers(thickness):
+        voxels = jl.VoxelMap.from_extinction(
+            leaf=0.5 / thickness * jnp.ones((1, 1, 12)),
+            voxel_size=jnp.stack([60.0, 60.0, thickness]),
+            origin=(-30.0, -30.0, 0.0),
+        )
+        canopy = jl.Canopy(voxels, leaf=jl.LeafOptics(0.4, 0.4), sides="periodic")
+        return jl.Scene(canopy=canopy, ground=jl.Ground(reflectance=0.2, slope=20.0))
+
+    lidar = jl.Lidar(divergence=5.0, pulse=jl.GaussianPulse(fwhm=4.0))
+    scenes = jax.vmap(layers)(jnp.array([0.2, 1.5]))
+    options = {"max_orders": 1, "n_rays": 16, "bin_width": 0.5, "window": (-150.0, 60.0)}
+    waves = jl.simulate_scenes(lidar, scenes, plan=jl.plan_scenes(lidar, scenes, **options), key=KEY)
+    for i in range(2):
+        scene = scene_number(scenes, i)
+        alone = jl.simulate(
+            lidar, scene, plan=jl.plan(lidar, scene, **options), key=jax.random.fold_in(KEY, i)
+        )
+        np.testing.assert_allclose(
+            waves[i].reflectance, alone.reflectance, atol=1e-3 * float(alone.reflectance.max())
+        )
+
+
 @pytest.mark.slow
 def test_effects_that_are_absent_from_one_scene_are_planned():
     empty, leafy = (stand(density, 2.0, 0.0, 0.3) for density in (0.0, 0.2))

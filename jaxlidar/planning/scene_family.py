@@ -55,6 +55,8 @@ def union_plan(
         start_distance=start_distance,
         max_path=max_path,
         max_flight=max(p.longest_flight(longest) for p in path_lengths),
+        # Numbers of segments and spans of bins are bounds for the longest chord of all scenes.
+        max_segment=max(p.limits.max_segment for p in plans),
     ).with_config(
         vertical=all(p.config.vertical for p in plans),
         max_ray_segments=max(p.config.max_ray_segments for p in plans),
