@@ -30,7 +30,7 @@ from jaxlidar._vectors import FAR, Scalar, Vec, with_derivative_of
 from jaxlidar.trace.device_scene import DeviceScene
 from jaxlidar.trace.meshes import surface_distances
 from jaxlidar.trace.photons import GAP, STOPPED, TRANSMITTED, Photons, attached_ratio, detach
-from jaxlidar.trace.voxel_traversal import march_to_depths
+from jaxlidar.trace.voxel_traversal import PathSlopes, march_to_depths
 
 
 class Flight(eqx.Module):
@@ -43,6 +43,8 @@ class Flight(eqx.Module):
       the probability of no collision.
     - `depth_slopes`: derivatives of the optical depth flown with respect to parameters; None without
       score functions.
+    - `path_slopes`: derivatives by the path of the optical depth of the whole flight; None where landing
+      points do not move.
     - `moved_w`: direction of flights whose landing points move (`jaxlidar.trace.reparametrisation`), equal to
       that of the photons but for its derivative; None where none move.
     """
@@ -55,6 +57,7 @@ class Flight(eqx.Module):
     distance: Float[Array, "*photons"]
     ratio: Float[Array, "*photons"]
     depth_slopes: Float[Array, "ends parameters photons"] | None = None
+    path_slopes: PathSlopes | None = None
     moved_w: Vec | None = None
 
     def direction(self, p: Photons) -> Vec:
@@ -140,10 +143,13 @@ def sample_flights(
     encounters: SurfaceEncounters,
     max_length: Float[Array, "photons"],
     u: Float[Array, "ends photons"],
+    *,
+    by_path: bool = False,
 ) -> Flight:
     """Let photons fly to collisions at the optical depths -ln(u), to the surface that stops them, or on.
 
-    A flight has one end for each number in `u`; `max_length`, m, is how far it can be recorded. The steps:
+    A flight has one end for each number in `u`; `max_length`, m, is how far it can be recorded. With
+    `by_path` it has `path_slopes`. The steps:
 
     1. March to the target depths, at most to the nearest stop or to `max_length`.
     2. Place each collision within its voxel, where the depth is linear, at a detached fraction of the chord
@@ -158,7 +164,7 @@ def sample_flights(
     if scene.medium is None:
         collided = stopped_in_medium = jnp.zeros(u.shape, bool)
         distance, ratio = to_ends(max_distance), jnp.ones_like(u)
-        cell, depth_slopes = jnp.zeros(u.shape, jnp.int32), None
+        cell, depth_slopes, path_slopes = jnp.zeros(u.shape, jnp.int32), None, None
     else:
         medium, target = scene.medium, -jnp.log(u)
         crossing = march_to_depths(
@@ -172,7 +178,9 @@ def sample_flights(
             scene.occupied_box,
             reverse=scene.reverse,
             slopes=scene.slopes,
+            by_path=by_path,
         )
+        path_slopes = crossing.path_slopes
         collided, cell, depth_slopes = crossing.crossed, crossing.cell, crossing.depth_slopes
         # Looked up again rather than carried through the march, whose loop takes most of the time.
         k = jnp.where(collided, jax.vmap(medium.extinction, (0, None))(cell, p.w), 1.0)
@@ -209,4 +217,5 @@ def sample_flights(
     hits_nothing = alive & ~collided & ~landed
     # Beyond `max_length` there is a surface, or still medium: its light comes after the record.
     late = hits_nothing & (to_ends(nearest_stop < FAR) | stopped_in_medium)
-    return Flight(collided, landed, late, hits_nothing & ~late, cell, distance, ratio, depth_slopes)
+    escaped = hits_nothing & ~late
+    return Flight(collided, landed, late, escaped, cell, distance, ratio, depth_slopes, path_slopes)

@@ -441,9 +441,10 @@ def fly(
     strata = jnp.stack([(i + (draws.flight * ends - selected)) / ends for i in range(ends)])
     # The logarithm of zero would be an infinite depth: depths end at -ln(1e-9) = 20.7.
     u = jnp.maximum(strata, 1e-9)
-    flights = sample_flights(scene, p, encounters, max_length, u)
+    moves = has_moving_landings(scene)
+    flights = sample_flights(scene, p, encounters, max_length, u, by_path=moves)
     # Rays of the first order move already (`rays_with_grids`).
-    if has_moving_landings(scene):
+    if moves:
         flights = move_landings(scene, p, encounters, flights, order > 0)
     # Optimisation barrier: flights serve several results, each of which would compute the march again.
     stops = (encounters.stops, encounters.nearest_stop, encounters.mesh_normal)

@@ -78,7 +78,6 @@ from jaxlidar.trace.flight import Flight, SurfaceEncounters
 from jaxlidar.trace.footprint import Beam
 from jaxlidar.trace.photons import Photons, attached_ratio, detach
 from jaxlidar.trace.surfaces import TracedSurface
-from jaxlidar.trace.voxel_traversal import march_to_depths
 
 # Widths of columns or cells, and the position of one of their corners, m.
 Grid = tuple[Float[Array, "2"], Float[Array, "2"]]
@@ -128,7 +127,8 @@ def move_landings(
     2. The landing point fixed between faces, and the ratio r: density of directions per area of the map.
     3. The fade and its gradient.
     4. The blend of both motions, and its ratio.
-    5. The transmittance of the path to the moved point, by a march of its own.
+    5. The transmittance of the path to the moved point: to first order, the optical depth at a fixed
+       direction grows by what the turn of the path and its change of length add.
 
     **Arguments:** `may_move`: False for the first order, whose rays move already (`rays_with_grids`).
 
@@ -136,7 +136,8 @@ def move_landings(
     """
     assert p.last_scattering is not None
     moves = may_move & p.alive & jnp.any(flights.landed, axis=0)
-    direct = along(p.x, p.w, jnp.where(moves, encounters.nearest_stop, 1.0))
+    direct_distance = jnp.where(moves, encounters.nearest_stop, 1.0)
+    direct = along(p.x, p.w, direct_distance)
     landing, triangle = jax.tree.map(detach, direct), encounters.mesh_normal
     targets: list[Target] = []
     for surface, stop in zip(scene.surfaces, encounters.stops):
@@ -196,19 +197,11 @@ def move_landings(
     # Values stay those that were drawn.
     w, distance = towards(*(a + fade * change for a, change in zip((x, y), difference)))
     w = vec(with_derivative_of(a, jnp.where(moves, b, a)) for a, b in zip(p.w, w))
-    if scene.medium is not None:
-        path = march_to_depths(
-            scene.medium,
-            p.x,
-            w,
-            jnp.zeros((0, distance.size)),
-            with_derivative_of(encounters.nearest_stop, distance),
-            moves,
-            scene.config.max_faces,
-            scene.occupied_box,
-            reverse=scene.reverse,
-        )
-        ratio = ratio * jnp.exp(detach(path.total_depth) - path.total_depth)
+    if flights.path_slopes is not None:
+        # Derivatives alone: values are zero.
+        turn = vec(a - detach(a) - (b - detach(b)) for a, b in zip(w, p.w))
+        longer = distance - detach(distance) - (direct_distance - detach(direct_distance))
+        ratio = ratio * jnp.exp(-flights.path_slopes.change(turn, longer))
     lands = flights.landed & jnp.broadcast_to(moves, flights.landed.shape)
 
     def moved(fixed: Scalar, changed: Scalar) -> Scalar:
@@ -219,7 +212,7 @@ def move_landings(
         flights,
         moved_w=vec(moved(a, b) for a, b in zip(p.w, w)),
         distance=moved(flights.distance, distance),
-        ratio=moved(flights.ratio, ratio),
+        ratio=moved(flights.ratio, flights.ratio * jnp.broadcast_to(ratio, lands.shape)),
     )
 
 

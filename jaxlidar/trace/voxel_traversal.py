@@ -16,6 +16,7 @@ import dataclasses
 from typing import NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
@@ -23,7 +24,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxlidar._mesh_axes import vary_together
 from jaxlidar._one_function import once, one_function
-from jaxlidar._vectors import FAR, Scalar, Vec, vec
+from jaxlidar._vectors import FAR, Scalar, Vec, dot, vec
 from jaxlidar._vmapped_loops import any_problem
 from jaxlidar.optics.leaf_angles import ANGLE_NODES, LeafAngles
 from jaxlidar.optics.phase import AbstractPhase
@@ -112,6 +113,15 @@ class Medium(eqx.Module):
     def projection_factor(self, w: Vec) -> Scalar | None:
         """Extinction along `w` per unit of `leaf`, 2 G(w); None where it is one."""
         return None if self.angle_tables is None else 2.0 * self.angle_tables.projection_at(w)
+
+    def relative_angle_slope(self, w: Vec) -> Scalar | None:
+        """Relative slope of the extinction of leaf by the vertical component of `w`; None without angles."""
+        if self.angle_tables is None:
+            return None
+        value, slope = jax.jvp(
+            lambda z: self.angle_tables.projection_at((w[0], w[1], z)), (w[2],), (jnp.ones_like(w[2]),)
+        )
+        return slope / jnp.maximum(value, 1e-30)
 
     def with_leaf_scaled(self, factor: Float[Array, ""]) -> "Medium":
         """Return the medium with the extinction of leaf multiplied by `factor`."""
@@ -293,6 +303,20 @@ def occupied_box(medium: Medium) -> VoxelBox:
     return tuple(low), tuple(high)
 
 
+class PathSlopes(eqx.Module):
+    """Derivatives of the optical depth of a ray by its path, detached.
+
+    - `direction`: by the components of its direction, at a fixed length, m. - `length`: by its length, 1/m.
+    """
+
+    direction: Vec
+    length: Float[Array, "*photons"]
+
+    def change(self, turn: Vec, longer: Scalar) -> Scalar:
+        """Optical depth, to first order, that a turn of the direction and a longer path add."""
+        return dot(self.direction, turn) + self.length * longer
+
+
 class DepthCrossings(eqx.Module):
     """The points of rays at which their optical depth reaches given targets.
 
@@ -304,6 +328,7 @@ class DepthCrossings(eqx.Module):
       target, where rays are not followed.
     - `depth_slopes`: derivatives, with respect to parameters, of the optical depth up to each target, or up
       to the end of the ray if there are no targets; None without score functions.
+    - `path_slopes`: derivatives of `total_depth` by the path; None where they are not asked for.
     """
 
     crossed: Bool[Array, "targets photons"]
@@ -314,6 +339,18 @@ class DepthCrossings(eqx.Module):
     distance: Float[Array, "photons"]
     total_depth: Float[Array, "photons"]
     depth_slopes: Float[Array, "ends parameters photons"] | None = None
+    path_slopes: PathSlopes | None = None
+
+
+class _PathSlopes(NamedTuple):
+    """Derivatives by the direction of a ray, of the distance of the last face and of the depth up to there.
+
+    - `extinction`: of the last voxel, 1/m.
+    """
+
+    distance: Vec
+    depth: Vec
+    extinction: Scalar
 
 
 class _March(NamedTuple):
@@ -323,7 +360,7 @@ class _March(NamedTuple):
     - `running`: False for rays that have stopped.
     - `crossings`: of every target, distances at which its voxel is entered (-1: not crossed) and left,
       optical depth at the former, and the cell.
-    - `depth_slopes`: as in `DepthCrossings`.
+    - `depth_slopes`: as in `DepthCrossings`. - `path_slopes`: None where they are not asked for.
     """
 
     distance: Float[Array, "photons"]
@@ -332,6 +369,7 @@ class _March(NamedTuple):
     running: Bool[Array, "photons"]
     crossings: tuple[Array, ...]
     depth_slopes: Float[Array, "ends parameters photons"] | None
+    path_slopes: _PathSlopes | None
 
 
 def march_to_depths(
@@ -346,6 +384,7 @@ def march_to_depths(
     *,
     reverse: bool = True,
     slopes: ExtinctionSlopes | None = None,
+    by_path: bool = False,
 ) -> DepthCrossings:
     """March rays to their largest target depth, to `max_length`, or until they leave the grid, or `box`.
 
@@ -366,6 +405,9 @@ def march_to_depths(
     - `max_faces`: bound on the number of faces crossed.
     - `reverse`: True if reverse-mode derivatives may be taken. Default True.
     - `slopes`: extinction derivatives, where derivatives of optical depths are asked for. Default None.
+    - `by_path`: True for `path_slopes`. A face at the distance s along axis i has the derivative
+      ds / dw_i = -s / w_i. The depth, the sum of k ds, has the sum over voxels of k times the difference
+      between the derivatives of the far and the near face. Default False.
     """
     ray = enter_grid(medium, x, w, box)
     end = minimum(ray.leave, max_length)
@@ -378,10 +420,18 @@ def march_to_depths(
         return jnp.broadcast_to(a, targets.shape)
 
     projection_factor = None if slopes is None else lax.stop_gradient(medium.projection_factor(w))
+    if by_path:
+        fixed = lax.stop_gradient((medium, x, w))
+        enter_by_direction, leave_by_direction = _bounds_by_direction(*fixed, box)
+        # At a fixed length the end of a ray that does not leave the grid does not depend on its direction.
+        leaves = lax.stop_gradient(ray.leave < max_length)
+        end_by_direction = vec(jnp.where(leaves, slope, 0.0) for slope in leave_by_direction)
+        minus_inverses = vec(-1.0 / jnp.where(jnp.abs(a) < 1e-12, 1.0, a) for a in fixed[2])
+        angle_slope = medium.relative_angle_slope(fixed[2])
 
     def step(state: _March, _):
         """March all rays by one step, 1 to 4 of `march_to_depths`."""
-        distance, depth, voxel, running, crossings, depth_slopes = state
+        distance, depth, voxel, running, crossings, depth_slopes, path_slopes = state
         faces = once(ray.face_distances(voxel))
         # Not before `distance`: a ray that starts on a face would step back by rounding.
         to = maximum(distance, minimum(end, minimum(minimum(faces[0], faces[1]), faces[2])))
@@ -406,10 +456,26 @@ def march_to_depths(
             assert depth_slopes is not None
             length = lax.stop_gradient(length)
             depth_slopes = slopes.add_segment(depth_slopes, cell, length, projection_factor)
+        if path_slopes is not None:
+            near, by_direction, extinction = path_slopes
+            far = vec(
+                select(to < end, select(face <= to, to * minus_inverse, jnp.zeros_like(to)), at_end)
+                for face, minus_inverse, at_end in zip(faces, minus_inverses, end_by_direction)
+            )
+            by_direction = vec(
+                sums + select(running, k * (b - a), jnp.zeros_like(k))
+                for sums, a, b in zip(by_direction, near, far)
+            )
+            if angle_slope is not None:
+                along_z = medium.leaf_extinction(cell, w) * angle_slope * (to - distance)
+                along_z = select(running, along_z, jnp.zeros_like(along_z))
+                by_direction = (*by_direction[:2], by_direction[2] + along_z)
+            path_slopes = lax.stop_gradient(_PathSlopes(far, by_direction, select(running, k, extinction)))
         # The voxel of a ray that has stopped does not matter.
         next_voxel = step_voxel(ray, voxel, faces, to)
         distance, depth = select(running, to, distance), select(running, next_depth, depth)
-        return _March(distance, depth, next_voxel, goes_on, crossings, depth_slopes), None
+        state = _March(distance, depth, next_voxel, goes_on, crossings, depth_slopes, path_slopes)
+        return state, None
 
     # A loop of static length has a reverse derivative; skipping dead blocks gives back the time of a loop
     # that stops early.
@@ -427,7 +493,11 @@ def march_to_depths(
     if slopes is not None:
         depth_slopes = jnp.zeros((max(len(targets), 1), slopes.count, *max_length.shape), max_length.dtype)
     running = active & (ray.enter < end)
-    state = _March(start, jnp.zeros_like(max_length), ray.voxel, running, no_crossings, depth_slopes)
+    depth = jnp.zeros_like(max_length)
+    path_slopes = None
+    if by_path:
+        path_slopes = _PathSlopes(enter_by_direction, (depth, depth, depth), depth)
+    state = _March(start, depth, ray.voxel, running, no_crossings, depth_slopes, path_slopes)
     state = vary_together(state)
 
     def march(state: _March) -> _March:
@@ -435,6 +505,10 @@ def march_to_depths(
 
     state = (march if reverse else one_function(march))(state)
     enter, leave, depth, cell = state.crossings
+    path_slopes = None
+    if state.path_slopes is not None:
+        _, by_direction, extinction = state.path_slopes
+        path_slopes = PathSlopes(by_direction, jnp.where(leaves, 0.0, extinction))
     return DepthCrossings(
         crossed=enter >= 0,
         cell=cell,
@@ -444,7 +518,22 @@ def march_to_depths(
         distance=state.distance,
         total_depth=state.depth,
         depth_slopes=state.depth_slopes,
+        path_slopes=path_slopes,
     )
+
+
+def _bounds_by_direction(medium: Medium, x: Vec, w: Vec, box: VoxelBox | None) -> tuple[Vec, Vec]:
+    """Return the derivatives of the distances at which rays enter and leave the grid by their direction."""
+
+    def bounds(w: Vec) -> tuple[Scalar, Scalar]:
+        ray = enter_grid(medium, x, w, box)
+        return ray.enter, ray.leave
+
+    one, zero = jnp.ones_like(w[0]), jnp.zeros_like(w[0])
+    columns = [
+        jax.jvp(bounds, (w,), (tuple(one if k == i else zero for k in range(3)),))[1] for i in range(3)
+    ]
+    return vec(column[0] for column in columns), vec(column[1] for column in columns)
 
 
 def voxel_at(medium: Medium, x: Vec) -> tuple[Vec, tuple[Int[Array, "*s"], ...]]:

@@ -25,6 +25,7 @@ from scipy.stats import norm
 import jaxlidar as jl
 from jaxlidar._vectors import FAR
 from jaxlidar.trace import higher_orders
+from jaxlidar.trace.voxel_traversal import march_to_depths
 from tests.helpers import slow_unless
 
 KEYS = 16
@@ -210,7 +211,23 @@ def test_a_motion_of_photons_that_collide_is_rejected(name, monkeypatch):
 
     def move_all(scene, p, encounters, flights, may_move):
         heads = jnp.broadcast_to(encounters.nearest_stop < FAR, flights.landed.shape)
-        heading = dataclasses.replace(flights, landed=flights.landed | (flights.collided & heads))
+        path = march_to_depths(
+            scene.medium,
+            p.x,
+            p.w,
+            jnp.zeros((0, p.weight.size)),
+            encounters.nearest_stop,
+            p.alive,
+            scene.config.max_faces,
+            by_path=True,
+        )
+        ratio = jnp.exp(jax.lax.stop_gradient(path.total_depth) - path.total_depth)
+        heading = dataclasses.replace(
+            flights,
+            landed=flights.landed | (flights.collided & heads),
+            ratio=jnp.broadcast_to(ratio, flights.ratio.shape),
+            path_slopes=path.path_slopes,
+        )
         moved = move_landings(scene, p, encounters, heading, may_move)
         distance = jnp.where(flights.landed, moved.distance, flights.distance)
         return dataclasses.replace(moved, landed=flights.landed, distance=distance)
