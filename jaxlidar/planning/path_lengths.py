@@ -30,6 +30,8 @@ from jaxlidar.scenes.terrain import Terrain
 # Least distance, m, of a sensor from a surface, and least angle, degrees, of its beam from the level within a
 # canopy that has no sides.
 LEAST_CLEARANCE, LEAST_ELEVATION = 1e-3, 1.0
+# Pairs of a sensor and a triangle whose distance is looked at.
+_SENSOR_TRIANGLE_PAIRS = 30_000_000
 # Beams at a smaller angle, degrees, to a plane meet it beyond the record, which they would make endless.
 LEAST_GRAZING_ANGLE = 0.5
 # A flight crosses at most so many voxels, because a batch waits for its longest flight.
@@ -416,11 +418,14 @@ def misplaced_sensors(shots: Survey | TracedBeam, scene: Scene) -> Iterator[tupl
 
 
 def check_sensors(shots: Survey, scene: Scene) -> None:
-    """Refuse sensors below the ground or in a plate, and level beams within a canopy that has no sides.
+    """Refuse sensors below the ground, in a plate or a triangle, and level beams in a canopy without sides.
 
     **Raises:** ValueError with the shot and the numbers.
     """
     sensor, which = shots.sensor, "" if len(shots) == 1 else f" of shot {{}} of {len(shots)}"
+    for surface in scene.surfaces:
+        if isinstance(surface, MeshMaterial) and surface.mesh.surfaces[0].name == surface.name:
+            _check_clear_of_triangles(shots, surface.mesh)
     for where, height, is_bad in misplaced_sensors(shots, scene):
         if not is_bad.any():
             continue
@@ -435,6 +440,56 @@ def check_sensors(shots: Survey, scene: Scene) -> None:
             f"sides, which a level beam never leaves; admissible is {LEAST_ELEVATION:g} degree or more "
             "from 90, or sides = 'open'"
         )
+
+
+def _check_clear_of_triangles(shots: Survey, mesh: MeshSurface) -> None:
+    """Refuse a sensor in a triangle: by rounding it would be on either side.
+
+    Sensors outside of the boxes of all instances are clear. Where many are within, as of a vehicle in a city,
+    so many pairs are looked at that it takes about a second.
+
+    **Raises:** ValueError with the shot.
+    """
+    if any(is_traced(x) for x in jax.tree.leaves(mesh)):
+        return
+    sensor, shot = np.unique(shots.sensor, axis=0, return_index=True)
+    boxes = mesh.bounds()
+    boxes = np.stack([boxes[:, 0] - LEAST_CLEARANCE, boxes[:, 1] + LEAST_CLEARANCE], axis=1)
+    is_within = ((sensor > boxes[:, 0].min(axis=0)) & (sensor < boxes[:, 1].max(axis=0))).all(axis=1)
+    n_pairs, corners = 0, None
+    for i in np.flatnonzero(is_within):
+        around = ((sensor[i] > boxes[:, 0]) & (sensor[i] < boxes[:, 1])).all(axis=1)
+        for instance in np.flatnonzero(around):
+            if n_pairs > _SENSOR_TRIANGLE_PAIRS:
+                return
+            corners = mesh.local_corners() if corners is None else corners
+            n_pairs += len(corners)
+            local, scale = mesh.to_local(sensor[i], int(instance))
+            clearance = LEAST_CLEARANCE / scale
+            low, high = corners.min(axis=1) - clearance, corners.max(axis=1) + clearance
+            near = corners[((local > low) & (local < high)).all(axis=1)]
+            if len(near) and _distance_to_triangles(local, near).min() < clearance:
+                which = "" if len(shots) == 1 else f" of shot {shot[i]} of {len(shots)}"
+                raise ValueError(
+                    f"sensor{which} = {[round(float(x), 3) for x in sensor[i]]} is in a triangle of a mesh; "
+                    f"admissible is more than {LEAST_CLEARANCE:g} m from it"
+                )
+
+
+def _distance_to_triangles(
+    point: Float[np.ndarray, "3"], corners: Float[np.ndarray, "n 3 3"]
+) -> Float[np.ndarray, " n"]:
+    """Return the distances of a point from triangles: from their planes where it is over them, else edges."""
+    start, edge = corners, np.roll(corners, -1, axis=1) - corners
+    normal = np.cross(edge[:, 0], edge[:, 1])
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    inward = np.cross(normal[:, None], edge)
+    is_over = (np.sum((point - start) * inward, axis=2) >= 0).all(axis=1)
+    to_plane = np.abs(np.sum((point - start[:, 0]) * normal, axis=1))
+    length = np.maximum(np.sum(edge * edge, axis=2), 1e-300)
+    along_edge = np.clip(np.sum((point - start) * edge, axis=2) / length, 0.0, 1.0)
+    to_edges = np.linalg.norm(point - start - along_edge[..., None] * edge, axis=2).min(axis=1)
+    return np.where(is_over, to_plane, to_edges)
 
 
 def _height_above(surface: AbstractSurface, sensor: Any) -> Any:

@@ -295,6 +295,34 @@ class MeshSurface(eqx.Module):
         placed = np.einsum("nij,vj->nvi", matrices, vertices) + concrete_array(places.shift)[:, None]
         return placed[:, faces].reshape(-1, 3, 3)
 
+    def local_corners(self) -> Float[np.ndarray, "triangles 3 3"]:
+        """Return the corners of the triangles in coordinates of the mesh, m, before copies are placed."""
+        return (concrete_array(self.vertices) + np.asarray(self.origin, float))[np.unique(self.faces, axis=0)]
+
+    def to_local(self, point: Float[np.ndarray, "3"], instance: int) -> tuple[Float[np.ndarray, "3"], float]:
+        """Return a point in coordinates of the mesh, as an instance sees it, and the scale of that."""
+        places = self.instances
+        rotation, scale = (
+            concrete_array(a)[instance : instance + 1] for a in (places.rotation, places.scale)
+        )
+        matrix = _matrices(rotation, scale, np)[0]
+        local = np.linalg.solve(matrix, point - concrete_array(places.shift)[instance])
+        return local, float(scale[0])
+
+    def gap_to_plane(self, normal: Float[np.ndarray, "3"], foot: Float[np.ndarray, "3"]) -> float:
+        """Return the distance, m, of the triangle that is nearest to a plane with all of its corners."""
+        corners, boxes, nearest = self.local_corners(), self.bounds(), np.inf
+        for instance, (low, high) in enumerate(boxes):
+            reach = 0.5 * (high - low) @ np.abs(normal) + 1.0
+            if abs((0.5 * (low + high) - foot) @ normal) > reach:
+                continue
+            # The plane in coordinates of the mesh, so that no copy of the corners is made.
+            origin, scale = self.to_local(foot, instance)
+            direction = self.to_local(foot + normal, instance)[0] - origin
+            distance = np.abs((corners - origin) @ (direction * scale)) * scale
+            nearest = min(nearest, float(distance.max(axis=1).min()))
+        return nearest
+
     def bounds(self, xp: Any = np) -> Any:
         """Return the lowest and the highest corner, m, of a box around each instance, (instances, 2, 3).
 
