@@ -350,7 +350,7 @@ class Lidar(eqx.Module):
 
     @property
     def view_radius(self) -> Float[Array, ""] | None:
-        """Radius in m of the field of view at the aim point, perpendicular to the beam; None without limit."""
+        """Radius in m of the field of view at the aim point, across the beam; None without limit."""
         field = self.field_of_view
         return None if field is None else self.range_to_reference * tan_half(field)
 
