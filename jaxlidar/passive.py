@@ -24,6 +24,7 @@ order in the exact direction of the sun, and exp(-tau_in - tau_out) in every oth
 """
 
 import dataclasses
+import functools
 from collections.abc import Sequence
 from typing import Any, final
 
@@ -189,7 +190,7 @@ def reflectance_factor(
     if any(plan.config.mirrors):
         raise ValueError("a surface of the scene is a smooth mirror; admissible is any other law")
     setup = make_setup(lidar, scene, plan)
-    is_hot_spot = plan.config.hotspot and _is_same_direction(sun_angles, view_angles)
+    is_hot_spot = _is_same_direction(sun_angles, view_angles) if plan.config.hotspot else False
     corner, size = _rectangle(setup.scene, area, centre)
     is_transformed = any(is_traced(x) for x in jax.tree.leaves((setup, sun_angles, key)))
     common = {
@@ -202,7 +203,18 @@ def reflectance_factor(
     }
     keys = jax.random.split(key, MIN_BATCHES)
     if is_transformed:
-        batches, unfollowed = jax.lax.map(lambda batch_key: _trace_batch(key=batch_key, **common), keys)
+
+        def trace_batch(batch_key: PRNGKeyArray) -> tuple[Array, Array]:
+            if isinstance(is_hot_spot, bool):
+                return _trace_batch(key=batch_key, **common)
+            # Traced angles: only their values tell whether sun and sensor stand in one direction.
+            traces = [
+                functools.partial(_trace_batch, key=batch_key, **{**common, "is_hot_spot": is_hot})
+                for is_hot in (True, False)
+            ]
+            return jax.lax.cond(is_hot_spot, *traces)
+
+        batches, unfollowed = jax.lax.map(trace_batch, keys)
     else:
         run_batch = _compiled_batch.bind(**common)
         with side_by_side() as run:
@@ -286,14 +298,15 @@ def _unit_vector(angles: tuple[Any, Any]) -> Vec:
     return vec((horizontal * jnp.sin(azimuth), horizontal * jnp.cos(azimuth), jnp.cos(zenith)))
 
 
-def _is_same_direction(sun: tuple[Any, Any], view: tuple[Any, Any]) -> bool:
-    """Return True for one direction; False where any angle is traced."""
-    angles = [concrete(angle) for angle in (*sun, *view)]
-    if any(angle is None for angle in angles):
-        return False
-    sun_zenith, sun_azimuth, view_zenith, view_azimuth = (float(angle) for angle in angles)  # pyright: ignore
+def _is_same_direction(sun: tuple[Any, Any], view: tuple[Any, Any]) -> Any:
+    """Return whether two directions are one: a bool, or a traced truth value where an angle is traced."""
+    sun_zenith, sun_azimuth, view_zenith, view_azimuth = (
+        angle if (value := concrete(angle)) is None else value.astype(jnp.zeros(()).dtype)
+        for angle in (*sun, *view)
+    )
     is_same_azimuth = (sun_azimuth - view_azimuth) % 360.0 == 0.0
-    return sun_zenith == view_zenith and (sun_zenith == 0.0 or is_same_azimuth)
+    is_same = (sun_zenith == view_zenith) & ((sun_zenith == 0.0) | is_same_azimuth)
+    return is_same if is_traced(is_same) else bool(is_same)
 
 
 def _sensor(view: tuple[Any, Any], wavelengths: Any, centre: np.ndarray) -> Lidar:

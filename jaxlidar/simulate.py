@@ -292,6 +292,11 @@ def _make_waveform(tracer: BatchTracer, result: _BatchResults, goal: _Goal) -> W
     errors = {name: value for name, value in errors.items() if value is not None}
     wave = dataclasses.replace(wave, info=result.info, **errors)
     if is_traced(wave.energy):
+        if lidar.opens_at_first_return:
+            raise ValueError(
+                "receiver window = 'first return' inside a JAX transformation, which traces where the record "
+                "begins; admissible is 'fixed': apply first_return_window outside"
+            )
         return wave
     refuse_excess(np.asarray(budget_excess(wave.energy_budget, result.energy_budget_stderr or {})))
     # Heights tell the zenith angle of a waveform's lidar, and nothing else its altitude.
