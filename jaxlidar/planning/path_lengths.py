@@ -432,7 +432,8 @@ def check_sensors(shots: Survey, scene: Scene) -> None:
         i = int(np.argmax(is_bad))
         if where != "level":
             raise ValueError(
-                f"sensor{which.format(i)} = {[round(float(x), 3) for x in sensor[i]]} is {where}, "
+                # Of a scene that was moved to its local origin the height alone is the user's.
+                f"sensor{which.format(i)} at the height {sensor[i, 2]:.9g} m is {where}, "
                 f"{float(height[i]):.3g} m above it; admissible is more than {LEAST_CLEARANCE:g} m"
             )
         raise ValueError(
@@ -471,7 +472,7 @@ def _check_clear_of_triangles(shots: Survey, mesh: MeshSurface) -> None:
             if len(near) and _distance_to_triangles(local, near).min() < clearance:
                 which = "" if len(shots) == 1 else f" of shot {shot[i]} of {len(shots)}"
                 raise ValueError(
-                    f"sensor{which} = {[round(float(x), 3) for x in sensor[i]]} is in a triangle of a mesh; "
+                    f"sensor{which} at the height {sensor[i, 2]:.9g} m is in a triangle of a mesh; "
                     f"admissible is more than {LEAST_CLEARANCE:g} m from it"
                 )
 

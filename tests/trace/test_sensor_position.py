@@ -484,3 +484,11 @@ def test_a_lidar_with_a_sensor_is_kept_in_files(tmp_path):
     np.testing.assert_array_equal(
         jl.open(tmp_path / "waveforms.nc").ground_position, waveforms.ground_position
     )
+
+
+def test_messages_do_not_show_the_local_origin():
+    lidar, scene = look((512345.25, 6123456.5, 420.0), 0.0), jl.Scene(ground=jl.Ground(height=430.0))
+    with pytest.raises(ValueError, match="at the height 420 m is below the ground") as refusal:
+        jl.plan(lidar, scene)
+    assert "0.0, 0.0" not in str(refusal.value)
+    assert "512345.25, 6123456.5, 420" in str(lidar)
