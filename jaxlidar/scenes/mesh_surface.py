@@ -516,7 +516,8 @@ def build_mesh_tree(meshes: Sequence[MeshSurface], period: Float[Array, "2"] | N
     materials, first_material = [jnp.zeros(first_row, jnp.int32)], 0
     for mesh in meshes:
         corners = mesh.vertices[mesh.faces]
-        rows, box = triangle_rows(corners)
+        group = jnp.asarray(mesh.group) + first_material
+        rows, box = triangle_rows(corners, group)
         longest = jnp.max(jnp.abs(corners - jnp.roll(corners, 1, axis=1)))
         longest_sides.append(longest * jnp.max(mesh.instances.scale))
         matrices = mesh.instances.matrices()
@@ -526,7 +527,6 @@ def build_mesh_tree(meshes: Sequence[MeshSurface], period: Float[Array, "2"] | N
         boxes.append(jnp.broadcast_to(box, (len(matrices), 2, 3)))
         numbers += [(first_row, len(mesh.faces), int(not mesh.two_sided))] * len(matrices)
         lower.append(rows)
-        group = jnp.asarray(mesh.group) + first_material
         materials.append(jnp.concatenate([jnp.zeros(len(rows) - len(group), jnp.int32), group]))
         first_row, first_material = first_row + len(rows), first_material + len(mesh.surfaces)
     matrix, shift, box = (jnp.concatenate(a) for a in (transforms, shifts, boxes))
@@ -557,7 +557,8 @@ def build_mesh_tree(meshes: Sequence[MeshSurface], period: Float[Array, "2"] | N
     upper, box = tree_rows(leaf_rows[order], low[order], high[order])
     instances = fill(jnp.asarray(numbers, jnp.int32), 0)[order]
     uniform = numbers[0] if len(set(numbers)) == 1 else None
-    tree = TriangleTree(jnp.concatenate([upper, *lower]), instances, box, uniform, period)
+    rows = jnp.concatenate([upper, *lower])
+    tree = TriangleTree(rows, instances, box, uniform, period, several_materials=first_material > 1)
     return MeshTree(
         tree,
         jnp.zeros_like(shift[0]),

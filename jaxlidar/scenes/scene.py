@@ -45,9 +45,9 @@ class Scene(eqx.Module):
     - `plates`: a sequence of `Plate`, or of other `AbstractSheet`. Default ().
     - `ground`: a `Ground`, a `Terrain`, another `AbstractGround`, or None. Default None.
     - `atmosphere`: an `Atmosphere`, or None. Default None.
-    - `meshes`: a sequence of `MeshSurface`. Triangles that lie in the ground are met before it. Beside a
-      canopy or terrain with periodic sides, they repeat with it; one that crosses a side enters by the
-      opposite one. Default ().
+    - `meshes`: a sequence of `MeshSurface`. Triangles that lie in the ground are met before it; of triangles
+      in one plane, those of the mesh that comes first in the sequence. Beside a canopy or terrain with
+      periodic sides, meshes repeat with it; one that crosses a side enters by the opposite one. Default ().
 
     **Raises:** TypeError for an argument of the wrong type; ValueError for a plate in the plane of the
     ground, of another plate, of a triangle or of a cell of the terrain, for a canopy with periodic sides

@@ -14,6 +14,8 @@ import numpy as np
 import pytest
 
 import jaxlidar as jl
+from jaxlidar._vectors import vec
+from jaxlidar.scenes.mesh_surface import build_mesh_tree
 from jaxlidar.spectral.apply_optics import budget_excess, refuse_excess
 
 GROUND = 0.3
@@ -65,6 +67,33 @@ def test_what_the_mesh_transmits_goes_on_to_the_ground():
         # The rim of the mesh is far away.
         assert abs(float(budget.returned[0]) - expected) < 4.0 * float(budget.stderr["returned"][0])
         assert float(budget.below[0]) == 0.0
+
+
+@pytest.mark.parametrize("zenith", [0.0, 45.0, 80.0, 88.0])
+def test_of_meshes_in_one_plane_rays_meet_the_first_named(zenith):
+    """Sheets in one sloping plane, with triangles that differ: rounding would mix them."""
+    wide, fall = sheet(5.0, 20.0), np.tan(np.deg2rad(20.0))
+    corners = np.array([[-37.3, -37.3], [37.3, -37.3], [37.3, 37.3], [-37.3, 37.3], [3.7, -1.2]])
+    faces = [[0, 1, 4], [1, 2, 4], [2, 3, 4], [3, 0, 4]]
+
+    def narrow(gap):
+        return jl.MeshSurface((np.c_[corners, 5.0 + gap - fall * corners[:, 1]], faces))
+
+    # Rays from 100 m above to points of both sheets, at any angle to the plane.
+    random = np.random.default_rng(0)
+    x, y = random.uniform(-30.0, 30.0, (2, 3000))
+    azimuth, theta = random.uniform(0.0, 2.0 * np.pi, 3000), np.deg2rad(zenith)
+    tangent = np.cross([1.0, 0.0, 0.0], normal := np.array([0.0, fall, 1.0]) / np.hypot(fall, 1.0))
+    side = np.cos(azimuth)[:, None] * [1.0, 0.0, 0.0] + np.sin(azimuth)[:, None] * -tangent
+    direction = -np.cos(theta) * normal + np.sin(theta) * side
+    start = np.stack([x, y, 5.0 - fall * y], axis=1) - 100.0 * direction
+    rays = [vec(jnp.asarray(a.T, float)) for a in (start, direction)]
+    for meshes in ((wide, narrow(0.0)), (narrow(0.0), wide)):
+        hit = build_mesh_tree(meshes).meet(*rays)
+        np.testing.assert_allclose(hit.distance, 100.0, rtol=1e-3)
+        assert not hit.material.any()
+    # Of sheets that are apart the upper one is met, whichever is named first.
+    assert build_mesh_tree((wide, narrow(0.003))).meet(*rays).material.all()
 
 
 def test_a_box_that_stands_on_the_ground_keeps_its_floor():
