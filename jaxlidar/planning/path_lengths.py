@@ -14,7 +14,14 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
-from jaxlidar._checks import array_namespace, concrete_array, concrete_number, fixed_array, is_traced
+from jaxlidar._checks import (
+    array_namespace,
+    concrete,
+    concrete_array,
+    concrete_number,
+    fixed_array,
+    is_traced,
+)
 from jaxlidar._vectors import FAR, vec
 from jaxlidar.instrument.lidar import AIM_DISTANCE, Lidar
 from jaxlidar.instrument.survey import Survey
@@ -30,6 +37,8 @@ from jaxlidar.scenes.terrain import Terrain
 # Least distance, m, of a sensor from a surface, and least angle, degrees, of its beam from the level within a
 # canopy that has no sides.
 LEAST_CLEARANCE, LEAST_ELEVATION = 1e-3, 1.0
+# Distance of a canopy or a mesh from all beams, m, beyond which it is in another place.
+FARTHEST_SCENE = 1e5
 # Pairs of a sensor and a triangle whose distance is looked at.
 _SENSOR_TRIANGLE_PAIRS = 30_000_000
 # Beams at a smaller angle, degrees, to a plane meet it beyond the record, which they would make endless.
@@ -629,6 +638,37 @@ def footprint_is_off_terrain(lidar: Lidar, scene: Scene) -> Any:
     # Rounding of single precision.
     slack = 1e-5 * (end - origin)
     return jnp.any((box[0] < origin - slack) | (box[1] > end + slack))
+
+
+def check_scene_near_beams(shots: Lidar | Survey, scene: Scene) -> None:
+    """Refuse a canopy or a mesh that is hundreds of kilometres away from all beams: its map is another one.
+
+    Distances are those of the axes of beams from a sphere around everything.
+
+    **Raises:** ValueError with the distance.
+    """
+    survey = shots if isinstance(shots, Survey) else Survey.of(shots)
+    boxes: dict[str, Any] = {}
+    if scene.canopy is not None and scene.canopy.sides == "open":
+        voxels = scene.canopy.voxels
+        boxes["canopy"] = [concrete(a) for a in (voxels.origin, voxels.top)]
+    if scene.period is None:
+        for i, mesh in enumerate(scene.meshes):
+            if not any(is_traced(x) for x in jax.tree.leaves(mesh)):
+                bounds = mesh.bounds()
+                boxes[f"meshes[{i}]"] = [bounds[:, 0].min(axis=0), bounds[:, 1].max(axis=0)]
+    for name, (low, high) in boxes.items():
+        if low is None or high is None:
+            continue
+        offset = 0.5 * (low + high) - survey.aim_point
+        along_beam = np.sum(offset * survey.direction, axis=1, keepdims=True)
+        to_axes = np.linalg.norm(offset - along_beam * survey.direction, axis=1)
+        distance = float(to_axes.min()) - 0.5 * float(np.linalg.norm(high - low))
+        if distance > FARTHEST_SCENE:
+            raise ValueError(
+                f"{name} is {1e-3 * distance:.4g} km away from every beam; admissible is up to "
+                f"{1e-3 * FARTHEST_SCENE:g} km: are its coordinates those of another map?"
+            )
 
 
 def check_footprints_on_terrain(shots: Lidar | Survey, scene: Scene) -> None:
