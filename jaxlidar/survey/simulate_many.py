@@ -41,7 +41,7 @@ from jaxlidar.scenes.scene_parts import SceneParts
 from jaxlidar.survey.acquisition import acquisition_of
 from jaxlidar.survey.choose_strategy import choose_strategy
 from jaxlidar.survey.collect import StoredResults, waveforms_in_memory, waveforms_on_disk
-from jaxlidar.survey.coverage import OffMapWarning, ground_heights, off_map, off_map_message
+from jaxlidar.survey.coverage import OffMapWarning, ground_heights, is_cut_off, off_map, off_map_message
 from jaxlidar.survey.results import OPTIONAL_ARRAYS
 from jaxlidar.survey.strategy import AbstractStrategy
 from jaxlidar.survey.tiled_scene import TiledSceneStrategy
@@ -122,9 +122,9 @@ def simulate_many(
 
     **Returns:** a `Waveforms`.
 
-    **Warns:** `OffMapWarning` where footprints lie partly outside the voxel map, `LateLightWarning` where
-    much light arrives after the end of the record, `UnfollowedLightWarning` where orders that are not
-    followed may add more than `rtol`.
+    **Warns:** `OffMapWarning` where footprints lie partly outside the voxel map of a stand,
+    `LateLightWarning` where much light arrives after the end of the record, `UnfollowedLightWarning` where
+    orders that are not followed may add more than `rtol`.
 
     **Raises:** TypeError for arguments of another class, and inside a JAX transformation. ValueError, before
     any work, for inadmissible arguments, a scene that reaches up to the sensor, shots that do not meet the
@@ -172,7 +172,9 @@ def simulate_many(
         setup = strategy.setup
         off_map_fractions = off_map(strategy.survey, setup.scene)
         heights = ground_heights(strategy.survey, setup.scene, setup.plan.limits.start_distance)
-    if (message := off_map_message(off_map_fractions)) is not None:
+    # Tiles are parts of a stand, whose sides are not looked at.
+    may_miss_plants = isinstance(scene, SceneParts) or (scene.canopy is not None and is_cut_off(scene.canopy))
+    if may_miss_plants and (message := off_map_message(off_map_fractions)) is not None:
         warn_user(message, OffMapWarning)
     survey_fields: dict[str, Any] = {
         "position": survey.position,
