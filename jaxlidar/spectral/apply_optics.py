@@ -48,7 +48,9 @@ MIN_WAVELENGTHS = 4
 # More wavelengths than this are a spectrum: standard errors are computed at pivot wavelengths.
 MAX_EXACT_WAVELENGTHS = 16
 
-# Rounding of the sum of an energy budget, and of the splines by which footprints share light.
+# By how much an energy budget may sum to more than 1 and its errors. Rounding makes up to 1e-6 of it.
+# Footprints that share light leave out the faintest coefficients of their splines, some of them negative: up
+# to 1.5e-3 at a tolerance of 0.3, and less in proportion to the tolerance.
 MAX_EXCESS = 2e-3
 
 
