@@ -54,6 +54,7 @@ from jaxlidar.instrument.lidar import Lidar
 from jaxlidar.planning.path_lengths import PathLengths
 from jaxlidar.planning.plan import MIN_BATCHES, Plan
 from jaxlidar.planning.plan import plan as make_plan
+from jaxlidar.planning.plan_check import check_plan
 from jaxlidar.planning.setup import Setup, make_setup
 from jaxlidar.planning.size_buckets import size_bucket
 from jaxlidar.sampling.errors import student_widening
@@ -148,8 +149,9 @@ def reflectance_factor(
 
     **Returns:** a `ReflectanceFactor`, with standard errors.
 
-    **Raises:** ValueError for inadmissible arguments, for surfaces that are mirrors, and where the geometry
-    is traced by a JAX transformation without a plan. TypeError for arguments of another kind.
+    **Raises:** ValueError for inadmissible arguments, for surfaces that are mirrors, for a plan that does not
+    fit scene and view, and where the geometry is traced by a JAX transformation without a plan. TypeError for
+    arguments of another kind.
 
     **Source:** Nicodemus et al. (1977), NBS Monograph 160; Schaepman-Strub et al. (2006), Remote Sens.
     Environ. 103, 27.
@@ -187,6 +189,9 @@ def reflectance_factor(
         sun_zenith = concrete(sun_angles[0])
         if plan.config.vertical and (sun_zenith is None or float(sun_zenith) != 0):
             raise ValueError("plan is for a sun in the zenith; make one for this sun")
+        # What is traced is checked by value (`make_setup`).
+        if not any(is_traced(x) for x in jax.tree.leaves((lidar, scene))):
+            check_plan(plan, lidar, scene)
     if any(plan.config.mirrors):
         raise ValueError("a surface of the scene is a smooth mirror; admissible is any other law")
     setup = make_setup(lidar, scene, plan)
@@ -242,8 +247,8 @@ def plan_reflectance(
     """Make the plan of `reflectance_factor`, for scenes that a JAX transformation traces.
 
     The plan serves other values of the same scene whose canopy and surfaces reach no higher, and other
-    directions no farther from the zenith. Within a JAX transformation the reflectance factor is NaN for
-    others, as far as they concern the view; the sun is not checked.
+    directions no farther from the zenith. Others are refused, as far as they concern the view, and within a
+    JAX transformation the reflectance factor is NaN; the sun is not checked.
 
     **Arguments:** `scene`, `sun`, `view`, `wavelengths`, `n_photons`, `max_orders`, `area`: as for
     `reflectance_factor`.

@@ -196,6 +196,15 @@ def test_a_plan_together_with_what_it_holds_is_refused(field):
         jl.reflectance_factor(scene, plan=plan, key=KEY, **options, **{field: 64})
 
 
+def test_a_plan_for_beams_nearer_to_the_zenith_is_refused():
+    """Within a transformation the factor is NaN."""
+    scene, options = slab(1.0, jl.LeafOptics(0.45, 0.4), 0.2), {"wavelengths": 1064.0}
+    sun = (30.0, 100.0)
+    plan = jl.plan_reflectance(scene, sun=sun, view=(20.0, 50.0), n_photons=64, max_orders=1, **options)
+    with pytest.raises(ValueError, match="the plan does not fit"):
+        jl.reflectance_factor(scene, sun=sun, view=(40.0, 50.0), plan=plan, key=KEY, **options)
+
+
 PLACE, TURNED, BESIDE = (30.0, 100.0), (30.0, 460.0), (31.0, 100.0)
 
 
