@@ -3,7 +3,7 @@
 ## Fits with a model
 
 `retrieve`, `retrieve_many`, `Unknown`, `LogNormal`, `Smooth`, `put_profile`, `Retrieval`, `Retrievals`,
-`Step`, `RetrievalProgress`, `AveragingKernel`.
+`Step`, `AveragingKernel`.
 
 ## Identifiability and verdicts
 
@@ -29,7 +29,7 @@
 
 ## GEDI and photon counters
 
-`gedi_metrics`, `GediMetrics`, `gedi_settings`, `GediSettings`, `gedi_table`, `TableProgress`,
+`gedi_metrics`, `GediMetrics`, `gedi_settings`, `GediSettings`, `gedi_table`,
 `photon_ground_and_canopy`, `PhotonHeights`.
 
 ## Comparison with references
@@ -64,7 +64,7 @@ from inversion.fit.profiles import AveragingKernel, put_profile
 from inversion.fit.quality import Verdict, judge_fit, judge_fits, judge_record
 from inversion.fit.result import Retrieval, Retrievals
 from inversion.fit.retrieval import retrieve
-from inversion.fit.retrieval_many import RetrievalProgress, retrieve_many
+from inversion.fit.retrieval_many import retrieve_many
 from inversion.fit.unknowns import Unknown
 from inversion.leaf.leaves import GapLightWarning, LeafFit, invert_leaves
 from inversion.metrics.comparison import ComparedColumn, Comparison, ComparisonStatistics, compare
@@ -78,7 +78,7 @@ from inversion.metrics.cover import (
 from inversion.metrics.decomposition import Echoes, gaussian_decomposition
 from inversion.metrics.deconvolution import richardson_lucy, wiener
 from inversion.metrics.gedi import GediMetrics, GediSettings, gedi_metrics, gedi_settings
-from inversion.metrics.gedi_table import TableProgress, gedi_table
+from inversion.metrics.gedi_table import gedi_table
 from inversion.metrics.heights import SignalEnds, find_ground, relative_heights, signal_ends
 from inversion.metrics.photons import PhotonHeights, photon_ground_and_canopy
 from inversion.metrics.points import EchoPoints, echo_points
@@ -102,7 +102,6 @@ __all__ = [
     "Retrieval",
     "Retrievals",
     "Step",
-    "RetrievalProgress",
     "AveragingKernel",
     # Identifiability and verdicts.
     "cramer_rao",
@@ -142,7 +141,6 @@ __all__ = [
     "gedi_settings",
     "GediSettings",
     "gedi_table",
-    "TableProgress",
     "photon_ground_and_canopy",
     "PhotonHeights",
     # Comparison with references.

@@ -20,7 +20,7 @@ waveforms is in the package `inversion`.
 ## Surveys of many shots
 
 `Survey`, `Trajectory`, `AbstractScan`, `Oscillating`, `RotatingPolygon`, `Conical`, `ground_position`,
-`simulate_many`, `Waveforms`, `SurveyProgress`, `SceneParts`, `Acquisition`, `DiscreteReturns`.
+`simulate_many`, `Waveforms`, `TaskProgress`, `SceneParts`, `Acquisition`, `DiscreteReturns`.
 
 ## Many scenes
 
@@ -86,7 +86,7 @@ from jaxlidar._checks import UnitWarning
 from jaxlidar._compilation_cache import CompilationCache, compilation_cache
 from jaxlidar._constants import SPEED_OF_LIGHT
 from jaxlidar._fingerprint import version_of
-from jaxlidar._progress import Progress
+from jaxlidar._progress import Progress, TaskProgress
 from jaxlidar._registry import register_public_objects, waveform_html
 from jaxlidar._workers import LostWorkersWarning
 from jaxlidar.analog import AnalogReturns, analog_returns, photon_paths
@@ -145,7 +145,6 @@ from jaxlidar.simulate import LateLightWarning, UnfollowedLightWarning, simulate
 from jaxlidar.spectral.waveform import Waveform, total_reflectance, waveform_of
 from jaxlidar.survey.acquisition import Acquisition
 from jaxlidar.survey.coverage import OffMapWarning, ground_position
-from jaxlidar.survey.progress import SurveyProgress
 from jaxlidar.survey.returns import DiscreteReturns
 from jaxlidar.survey.simulate_many import simulate_many
 from jaxlidar.survey.truths import Truths
@@ -191,7 +190,6 @@ __all__ = [
     "ground_position",
     "simulate_many",
     "Waveforms",
-    "SurveyProgress",
     "SceneParts",
     "Acquisition",
     "DiscreteReturns",
@@ -254,6 +252,7 @@ __all__ = [
     "LSystem",
     "Rule",
     "Symbol",
+    "TaskProgress",
     "Word",
     "turtle",
     "voxelise",

@@ -427,11 +427,14 @@ MAGNITUDES = {
     "wavelength": Magnitude("nm", 100.0, 1e5, {"um": 1e3, "m": 1e9, "pm": 1e-3}),
     # From a bench to beyond all orbits.
     "altitude": Magnitude("m", 1.0, 1e8, {"km": 1e3, "mm": 1e-3}),
-    # From less than the diffraction of a telescope of 2 m to a floodlight.
-    "divergence": Magnitude("mrad", 4e-4, 1e3, {"rad": 1e3, "urad": 1e-3}),
+    # From less than the diffraction of a telescope of 2 m to the largest that is admissible.
+    "divergence": Magnitude("mrad", 4e-4, 300.0, {"rad": 1e3, "urad": 1e-3}),
     # From less than a hundredth of any beam to the whole half-space.
     "field_of_view": Magnitude("mrad", 5e-5, 3.2e3, {"rad": 1e3, "urad": 1e-3}),
     "aperture": Magnitude("m", 0.0, 100.0, {"mm": 1e-3, "cm": 1e-2}),
+    # From one pulse in two seconds; and from half angles that are narrower than any in use.
+    "pulse_rate": Magnitude("1/s", 0.5, np.inf, {"MHz": 1e6, "kHz": 1e3}),
+    "half_angle": Magnitude("degrees", 0.8, 90.0, {"rad": 180.0 / np.pi}),
     "energy": Magnitude("J", 0.0, 100.0, {"uJ": 1e-6, "mJ": 1e-3}),
     # From a femtosecond.
     "sampling_interval": Magnitude("ns", 1e-6, np.inf, {"s": 1e9}),

@@ -30,7 +30,7 @@ from jaxlidar.sampling.adaptive import (
 )
 from jaxlidar.sampling.moments import RunningMoments
 from jaxlidar.scenes.scene import Scene, check_kinds
-from jaxlidar.spectral.apply_optics import setup_optics
+from jaxlidar.spectral.apply_optics import budget_excess, refuse_excess, setup_optics
 from jaxlidar.trace.absorption import EnergyFractions, from_beam, from_parallel_light, trace_to_end
 from jaxlidar.trace.device_scene import build_device_scene
 
@@ -157,6 +157,9 @@ def energy_budget(
     mean, stderr = (
         _by_name(fractions, names) for fractions in (estimate.moments.mean, estimate.moments.stderr)
     )
+    # Light that arrives at the ground is absorbed there or goes on: it is no further fate.
+    budget, errors_of_budget = ({k: v for k, v in a.items() if k != "transmitted"} for a in (mean, stderr))
+    refuse_excess(np.asarray(budget_excess(budget, errors_of_budget)))
     return EnergyBudget(
         absorbed={name: mean[name] for name in names},
         returned=mean["returned"],

@@ -24,6 +24,7 @@ order in the exact direction of the sun, and exp(-tau_in - tau_out) in every oth
 """
 
 import dataclasses
+import functools
 from collections.abc import Sequence
 from typing import Any, final
 
@@ -53,6 +54,7 @@ from jaxlidar.instrument.lidar import Lidar
 from jaxlidar.planning.path_lengths import PathLengths
 from jaxlidar.planning.plan import MIN_BATCHES, Plan
 from jaxlidar.planning.plan import plan as make_plan
+from jaxlidar.planning.plan_check import check_plan
 from jaxlidar.planning.setup import Setup, make_setup
 from jaxlidar.planning.size_buckets import size_bucket
 from jaxlidar.sampling.errors import student_widening
@@ -147,8 +149,9 @@ def reflectance_factor(
 
     **Returns:** a `ReflectanceFactor`, with standard errors.
 
-    **Raises:** ValueError for inadmissible arguments, for surfaces that are mirrors, and where the geometry
-    is traced by a JAX transformation without a plan. TypeError for arguments of another kind.
+    **Raises:** ValueError for inadmissible arguments, for surfaces that are mirrors, for a plan that does not
+    fit scene and view, and where the geometry is traced by a JAX transformation without a plan. TypeError for
+    arguments of another kind.
 
     **Source:** Nicodemus et al. (1977), NBS Monograph 160; Schaepman-Strub et al. (2006), Remote Sens.
     Environ. 103, 27.
@@ -186,10 +189,13 @@ def reflectance_factor(
         sun_zenith = concrete(sun_angles[0])
         if plan.config.vertical and (sun_zenith is None or float(sun_zenith) != 0):
             raise ValueError("plan is for a sun in the zenith; make one for this sun")
+        # What is traced is checked by value (`make_setup`).
+        if not any(is_traced(x) for x in jax.tree.leaves((lidar, scene))):
+            check_plan(plan, lidar, scene)
     if any(plan.config.mirrors):
         raise ValueError("a surface of the scene is a smooth mirror; admissible is any other law")
     setup = make_setup(lidar, scene, plan)
-    is_hot_spot = plan.config.hotspot and _is_same_direction(sun_angles, view_angles)
+    is_hot_spot = _is_same_direction(sun_angles, view_angles) if plan.config.hotspot else False
     corner, size = _rectangle(setup.scene, area, centre)
     is_transformed = any(is_traced(x) for x in jax.tree.leaves((setup, sun_angles, key)))
     common = {
@@ -202,7 +208,18 @@ def reflectance_factor(
     }
     keys = jax.random.split(key, MIN_BATCHES)
     if is_transformed:
-        batches, unfollowed = jax.lax.map(lambda batch_key: _trace_batch(key=batch_key, **common), keys)
+
+        def trace_batch(batch_key: PRNGKeyArray) -> tuple[Array, Array]:
+            if isinstance(is_hot_spot, bool):
+                return _trace_batch(key=batch_key, **common)
+            # Traced angles: only their values tell whether sun and sensor stand in one direction.
+            traces = [
+                functools.partial(_trace_batch, key=batch_key, **{**common, "is_hot_spot": is_hot})
+                for is_hot in (True, False)
+            ]
+            return jax.lax.cond(is_hot_spot, *traces)
+
+        batches, unfollowed = jax.lax.map(trace_batch, keys)
     else:
         run_batch = _compiled_batch.bind(**common)
         with side_by_side() as run:
@@ -230,8 +247,8 @@ def plan_reflectance(
     """Make the plan of `reflectance_factor`, for scenes that a JAX transformation traces.
 
     The plan serves other values of the same scene whose canopy and surfaces reach no higher, and other
-    directions no farther from the zenith. Within a JAX transformation the reflectance factor is NaN for
-    others, as far as they concern the view; the sun is not checked.
+    directions no farther from the zenith. Others are refused, as far as they concern the view, and within a
+    JAX transformation the reflectance factor is NaN; the sun is not checked.
 
     **Arguments:** `scene`, `sun`, `view`, `wavelengths`, `n_photons`, `max_orders`, `area`: as for
     `reflectance_factor`.
@@ -286,14 +303,15 @@ def _unit_vector(angles: tuple[Any, Any]) -> Vec:
     return vec((horizontal * jnp.sin(azimuth), horizontal * jnp.cos(azimuth), jnp.cos(zenith)))
 
 
-def _is_same_direction(sun: tuple[Any, Any], view: tuple[Any, Any]) -> bool:
-    """Return True for one direction; False where any angle is traced."""
-    angles = [concrete(angle) for angle in (*sun, *view)]
-    if any(angle is None for angle in angles):
-        return False
-    sun_zenith, sun_azimuth, view_zenith, view_azimuth = (float(angle) for angle in angles)  # pyright: ignore
+def _is_same_direction(sun: tuple[Any, Any], view: tuple[Any, Any]) -> Any:
+    """Return whether two directions are one: a bool, or a traced truth value where an angle is traced."""
+    sun_zenith, sun_azimuth, view_zenith, view_azimuth = (
+        angle if (value := concrete(angle)) is None else value.astype(jnp.zeros(()).dtype)
+        for angle in (*sun, *view)
+    )
     is_same_azimuth = (sun_azimuth - view_azimuth) % 360.0 == 0.0
-    return sun_zenith == view_zenith and (sun_zenith == 0.0 or is_same_azimuth)
+    is_same = (sun_zenith == view_zenith) & ((sun_zenith == 0.0) | is_same_azimuth)
+    return is_same if is_traced(is_same) else bool(is_same)
 
 
 def _sensor(view: tuple[Any, Any], wavelengths: Any, centre: np.ndarray) -> Lidar:

@@ -46,7 +46,7 @@ from jaxlidar.sampling.errors import student_widening
 from jaxlidar.sampling.moments import RunningMoments
 from jaxlidar.sampling.waveform_moments import WaveformErrors, make_waveform_moments
 from jaxlidar.scenes.scene import Scene, check_kinds
-from jaxlidar.spectral.apply_optics import BudgetTerms, samples_and_budget
+from jaxlidar.spectral.apply_optics import BudgetTerms, budget_excess, refuse_excess, samples_and_budget
 from jaxlidar.spectral.waveform import Waveform, open_at_first_return
 from jaxlidar.trace.response import Response, trace_device_scene
 from jaxlidar.truth import truth_of_setup
@@ -292,7 +292,13 @@ def _make_waveform(tracer: BatchTracer, result: _BatchResults, goal: _Goal) -> W
     errors = {name: value for name, value in errors.items() if value is not None}
     wave = dataclasses.replace(wave, info=result.info, **errors)
     if is_traced(wave.energy):
+        if lidar.opens_at_first_return:
+            raise ValueError(
+                "receiver window = 'first return' inside a JAX transformation, which traces where the record "
+                "begins; admissible is 'fixed': apply first_return_window outside"
+            )
         return wave
+    refuse_excess(np.asarray(budget_excess(wave.energy_budget, result.energy_budget_stderr or {})))
     # Heights tell the zenith angle of a waveform's lidar, and nothing else its altitude.
     wave = dataclasses.replace(
         wave, info={**result.info, "altitude": None if lidar.altitude is None else float(lidar.altitude)}

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import jaxlidar as jl
+from jaxlidar.passive import _is_same_direction
 from tests.helpers import slow_unless
 
 KEY = jax.random.key(0)
@@ -193,3 +194,54 @@ def test_a_plan_together_with_what_it_holds_is_refused(field):
     plan = jl.plan_reflectance(scene, n_photons=64, **options)
     with pytest.raises(ValueError, match=f"plan is given together with {field}; admissible is either"):
         jl.reflectance_factor(scene, plan=plan, key=KEY, **options, **{field: 64})
+
+
+def test_a_plan_for_beams_nearer_to_the_zenith_is_refused():
+    """Within a transformation the factor is NaN."""
+    scene, options = slab(1.0, jl.LeafOptics(0.45, 0.4), 0.2), {"wavelengths": 1064.0}
+    sun = (30.0, 100.0)
+    plan = jl.plan_reflectance(scene, sun=sun, view=(20.0, 50.0), n_photons=64, max_orders=1, **options)
+    with pytest.raises(ValueError, match="the plan does not fit"):
+        jl.reflectance_factor(scene, sun=sun, view=(40.0, 50.0), plan=plan, key=KEY, **options)
+
+
+PLACE, TURNED, BESIDE = (30.0, 100.0), (30.0, 460.0), (31.0, 100.0)
+
+
+def factor_of_angles():
+    """Return the reflectance factor of a slab as a function of sun and view, by one plan."""
+    scene, options = slab(1.0, jl.LeafOptics(0.45, 0.4), 0.2), {"wavelengths": 1064.0}
+    plan = jl.plan_reflectance(scene, sun=PLACE, view=PLACE, n_photons=512, max_orders=2, **options)
+
+    def factor(sun, view):
+        return jl.reflectance_factor(scene, sun=sun, view=view, plan=plan, key=KEY, **options).reflectance[0]
+
+    return factor
+
+
+@pytest.mark.parametrize(("sun", "is_same"), [(PLACE, True), (TURNED, True), (BESIDE, False)])
+def test_one_direction_is_known_by_value(sun, is_same):
+    assert _is_same_direction(sun, PLACE) is is_same
+    assert bool(jax.jit(_is_same_direction)(sun, PLACE)) == is_same
+    assert bool(jax.jit(lambda azimuth: _is_same_direction((0.0, azimuth), (0.0, 10.0)))(50.0))
+
+
+@pytest.mark.slow
+def test_the_hot_spot_does_not_depend_on_tracing():
+    """Sun and sensor in one direction, whether JAX knows it or not; and beside it."""
+    factor = factor_of_angles()
+    traced_sun = jax.jit(lambda sun: factor(sun, PLACE))
+    eager = float(factor(PLACE, PLACE))
+    for sun in (PLACE, TURNED):
+        assert float(traced_sun(sun)) == pytest.approx(eager, rel=1e-5)
+    assert float(traced_sun(BESIDE)) < 0.85 * eager
+
+
+@pytest.mark.slow
+def test_the_hot_spot_of_any_angles():
+    factor = factor_of_angles()
+    eager, beside = float(factor(PLACE, PLACE)), float(factor(BESIDE, PLACE))
+    assert float(jax.jit(factor)(PLACE, PLACE)) == pytest.approx(eager, rel=1e-5)
+    assert float(jax.jit(factor)(BESIDE, PLACE)) == pytest.approx(beside, rel=1e-5)
+    by_vmap = jax.vmap(lambda zenith: factor((zenith, 100.0), PLACE))(jnp.array([30.0, 31.0]))
+    np.testing.assert_allclose(by_vmap, [eager, beside], rtol=1e-5)

@@ -18,7 +18,6 @@ CUBE = np.full((1, 1, 1), 0.5)
 
 ABSURD = {
     "divergence": (lambda: jl.Lidar(divergence=3e-4), "3e-4 mrad", "in rad.* is 0.3 mrad"),
-    "divergence, large": (lambda: jl.Lidar(divergence=6000.0), "6000 mrad", "in urad.* is 6 mrad"),
     "wavelength": (lambda: jl.Lidar(wavelength=1.064), "1.064 nm", "in um.* is 1064 nm"),
     "one of the wavelengths": (lambda: jl.Lidar(wavelength=(1.55, 1064.0)), "1.55 nm", "in um.* is 1550 nm"),
     "wavelength in m": (lambda: jl.Lidar(wavelength=532e-9), "5.32e-7 nm", "in m.* is 532 nm"),

@@ -18,6 +18,7 @@ import dataclasses
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
+from time import perf_counter
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -45,7 +46,7 @@ from inversion.fit.solver import (
 )
 from inversion.fit.unknowns import BoundUnknown, Unknown, bind_unknowns, smooth_names, with_start
 from inversion.receiver.recorder import Recorder
-from jaxlidar import Lidar, Plan, Scene
+from jaxlidar import Lidar, Plan, Scene, TaskProgress
 from jaxlidar.extend import (
     ONE_CORE,
     as_numpy,
@@ -63,30 +64,6 @@ from jaxlidar.io.checkpoint import Checkpoint, open_checkpoint
 # Chunks of a worker are this many times its lockstep group: it is busy while slow fits end, and loses little
 # if it dies.
 _GROUPS_PER_CHUNK = 4
-
-
-@dataclasses.dataclass(frozen=True)
-class RetrievalProgress:
-    """Progress of `retrieve_many`.
-
-    - `done`: fits that have ended.
-    - `total`: fits in all.
-    - `converged`: fits that have converged.
-
-    **Example:**
-
-    >>> import jaxlidar as jl
-    >>> import inversion
-    >>> print(inversion.RetrievalProgress(done=3, total=10, converged=2))
-    3 of 10 fits, 2 converged
-    """
-
-    done: int
-    total: int
-    converged: int
-
-    def __str__(self) -> str:
-        return f"{self.done} of {self.total} fits, {self.converged} converged"
 
 
 def retrieve_many(
@@ -112,7 +89,7 @@ def retrieve_many(
     lanes: int = 16,
     path: str | os.PathLike[str] | None = None,
     executor: Executor | None = None,
-    progress: Callable[[RetrievalProgress], None] | None = None,
+    progress: Callable[[TaskProgress], None] | None = None,
 ) -> Retrievals:
     """Retrieve unknowns of a scene from many waveforms, each separately, as `retrieve` does for one.
 
@@ -142,7 +119,7 @@ def retrieve_many(
     - `executor`: a `concurrent.futures.Executor`, whose workers fit chunks of footprints, as for
       `jaxlidar.simulate_many`. Unknowns are sent to them: give paths, or functions of a module. A chunk whose
       worker dies gets a second try. Default None: this process.
-    - `progress`: called with a `RetrievalProgress` after every fit.
+    - `progress`: called with a `TaskProgress` after every fit.
 
     **Returns:** a `Retrievals`, which does not depend on the number of workers.
 
@@ -248,6 +225,7 @@ def retrieve_many(
     no_checkpoint = contextlib.nullcontext()
     with no_checkpoint if path is None else open_checkpoint(path, fingerprint(problem_parts)) as checkpoint:
         finished = FinishedFits(checkpoint, n_footprints, summary_sizes)
+        start_time, n_stored = perf_counter(), len(finished.summaries)
         missing = [i for i in range(n_footprints) if i not in finished.summaries]
         fits = (
             run_fits(problem, key, missing)
@@ -257,7 +235,9 @@ def retrieve_many(
         for i, summary in fits:
             finished.add(i, summary)
             if progress is not None:
-                progress(finished.progress())
+                n_converged = sum(fit.converged for fit in finished.summaries.values())
+                counts = len(finished.summaries), n_footprints
+                progress(TaskProgress(*counts, perf_counter() - start_time, "fits", n_stored, n_converged))
     return retrievals_of([finished.summaries[i] for i in range(n_footprints)], all_unknowns)
 
 
@@ -356,11 +336,6 @@ class FinishedFits:
                     f"{error}. The fits go on, and are returned; every further one tries to write what is "
                     "missing"
                 )
-
-    def progress(self) -> RetrievalProgress:
-        """Return the progress so far."""
-        n_converged = sum(summary.converged for summary in self.summaries.values())
-        return RetrievalProgress(len(self.summaries), self.n_footprints, n_converged)
 
 
 # -- fits in lockstep

@@ -31,7 +31,7 @@ from jaxtyping import Float, Int
 import jaxlidar as jl
 from inversion.fit.quality import Verdict, judge_fits
 from inversion.fit.result import Retrievals
-from inversion.fit.retrieval_many import RetrievalProgress, retrieve_many
+from inversion.fit.retrieval_many import retrieve_many
 from inversion.fit.unknowns import Unknown
 from inversion.metrics.gedi import RECEIVER_SMOOTHING, judge_shot
 from inversion.scene.layered_canopy import LAYERS, LayeredCanopy
@@ -175,7 +175,7 @@ def fit_gedi_shots(
     lowest_mode: Float[np.ndarray, " shots"],
     *,
     path: str | os.PathLike[str] | None = None,
-    progress: Callable[[RetrievalProgress], None] | None = None,
+    progress: Callable[[jl.TaskProgress], None] | None = None,
 ) -> GediFits:
     """Fit shots, some of them from two grounds, all in one batch.
 
@@ -240,7 +240,7 @@ def _prepare(shot: Any, ground: float, lowest_mode: float) -> list[PreparedShot]
 def _fit(
     prepared: list[PreparedShot],
     path: str | os.PathLike[str] | None,
-    progress: Callable[[RetrievalProgress], None] | None,
+    progress: Callable[[jl.TaskProgress], None] | None,
 ) -> Retrievals:
     """Fit prepared shots in one batch."""
     size = max(np.size(p.shot.pulse_time) for p in prepared)

@@ -35,7 +35,6 @@ import numpy as np
 from jaxtyping import ArrayLike, Float
 
 from inversion.fit.quality import Verdict
-from inversion.fit.retrieval_many import RetrievalProgress
 from inversion.metrics.cover import ground_and_canopy, plant_area_profile
 from inversion.metrics.gedi import (
     RECEIVER_SMOOTHING,
@@ -51,6 +50,7 @@ from inversion.metrics.gedi_fit import CANOPY, ESTIMATES, LAYER_ESTIMATES, fit_g
 from inversion.metrics.heights import find_ground, signal_ends
 from inversion.metrics.records import size_bucket
 from inversion.scene.layered_canopy import LAYERS, REFLECTANCE_RATIO
+from jaxlidar import TaskProgress
 from jaxlidar.extend import (
     as_numpy,
     check_integer,
@@ -90,29 +90,6 @@ _EDGES = 5.0 * np.arange(31)
 _RH_AXIS = ColumnAxis("percentile", np.arange(101.0), "percent")
 
 
-class TableProgress(NamedTuple):
-    """Progress of `gedi_table`, which calls its argument `progress` with it. Printed, it is one line.
-
-    - `done`, `total`: number of shots, or of fits.
-    - `seconds`: time elapsed.
-    - `stage`: "shots" while closed forms are computed, then "fits" if there are any. Default "shots".
-
-    **Example:**
-
-    >>> import inversion
-    >>> print(inversion.TableProgress(64, 300, 2.5))
-    64 of 300 shots, 2.5 s
-    """
-
-    done: int
-    total: int
-    seconds: float
-    stage: str = "shots"
-
-    def __str__(self) -> str:
-        return f"{self.done} of {self.total} {self.stage}, {self.seconds:.1f} s"
-
-
 def gedi_table(
     shots: Any,
     *,
@@ -123,7 +100,7 @@ def gedi_table(
     clumping: float = 1.0,
     fit: bool = False,
     path: str | os.PathLike[str] | None = None,
-    progress: Callable[[TableProgress], Any] | None = None,
+    progress: Callable[[TaskProgress], Any] | None = None,
 ) -> ShotTable:
     """Return a table of GEDI shots: ground, relative heights, cover and plant area, with standard errors.
 
@@ -144,7 +121,7 @@ def gedi_table(
     - `fit`: also fit a layered canopy over sloping ground to each shot, see below. Default False.
     - `path`: a checkpoint that stores every fit once it has ended, as for `inversion.retrieve_many`: the same
       call continues with it. Default None: no file.
-    - `progress`: called with a `TableProgress` after each batch of shots, and after each fit. Default None.
+    - `progress`: called with a `TaskProgress` after each batch of shots, and after each fit. Default None.
 
     **Returns:** a `jaxlidar.io.ShotTable`, a row for each shot in their order, with
 
@@ -229,17 +206,13 @@ def gedi_table(
             estimates[name][batch] = values
         if progress is not None:
             seconds = time.perf_counter() - start_time
-            progress(TableProgress(int(first + batch.size), int(usable.size), seconds))
+            progress(TaskProgress(int(first + batch.size), int(usable.size), seconds))
     verdicts = [_verdict_after(verdict, estimates, i) for i, verdict in enumerate(verdicts)]
     table = _table(rows, estimates, verdicts, group, structure)
     if not fit:
         return table
 
-    def report(fits: RetrievalProgress) -> None:
-        if progress is not None:
-            progress(TableProgress(fits.done, fits.total, time.perf_counter() - start_time, "fits"))
-
-    columns, attributes = _fit_columns(rows, estimates, verdicts, path, report)
+    columns, attributes = _fit_columns(rows, estimates, verdicts, path, progress)
     return ShotTable(table.columns | columns, table.attributes | attributes)
 
 
@@ -620,7 +593,7 @@ def _fit_columns(
     estimates: dict[str, np.ndarray],
     verdicts: list[Verdict],
     path: str | os.PathLike[str] | None,
-    progress: Callable[[RetrievalProgress], None],
+    progress: Callable[[TaskProgress], Any] | None,
 ) -> tuple[dict[str, Column], dict[str, str]]:
     """Return the columns of fits, and the attributes that describe them.
 

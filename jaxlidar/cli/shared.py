@@ -9,7 +9,7 @@ from typing import Any
 
 import click
 
-from jaxlidar._progress import Progress
+from jaxlidar._progress import Progress, TaskProgress
 from jaxlidar.io import atomic_write
 from jaxlidar.io.stores import is_zarr
 
@@ -86,7 +86,7 @@ def simulation_progress_bar(quiet: bool) -> Iterator[Callable[[Progress], None]]
 
 
 @contextlib.contextmanager
-def survey_progress_bar(quiet: bool, shots: int) -> Iterator[Callable[[Any], None]]:
+def survey_progress_bar(quiet: bool, shots: int) -> Iterator[Callable[[TaskProgress], None]]:
     """Show a progress bar for `simulate_many` on the standard error, if that is a terminal.
 
     **Returns:** a context with the function to pass as `progress=`.
@@ -96,7 +96,7 @@ def survey_progress_bar(quiet: bool, shots: int) -> Iterator[Callable[[Any], Non
     disable = True if quiet else None
     bar = tqdm(total=shots, unit=" shots", disable=disable, file=sys.stderr, leave=False, desc="simulating")
 
-    def show(progress: Any) -> None:
+    def show(progress: TaskProgress) -> None:
         bar.n = progress.done
         bar.refresh()
 

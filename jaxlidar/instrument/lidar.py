@@ -51,6 +51,8 @@ from jaxlidar.instrument.scan import AbstractScan
 AIM_DISTANCE = 1.0
 # Largest zenith angle, degrees, of a beam that is to meet the reference plane, and of any beam.
 _MAX_ZENITH, STRAIGHT_UP = 89.0, 180.0
+# Largest divergence, mrad: beyond, a beam's irradiance is no longer that of a disc across its axis.
+_MAX_DIVERGENCE = 300.0
 
 
 class _Default:
@@ -84,6 +86,14 @@ def _position(x: Any) -> Array | np.ndarray:
     return coordinates("position", 3 if _is_sensor(x) else 2)(x)
 
 
+def tan_half(angle: ArrayLike, xp: Any = jnp) -> Any:
+    """Return the tangent of half an angle in mrad: the radius of a cone over its length.
+
+    Angles of half a turn or more count as a little less.
+    """
+    return xp.tan(xp.minimum(0.5e-3 * xp.asarray(angle), 0.5 * math.pi - 1e-3))
+
+
 # Compiled: plans evaluate these often, and dispatching their operations one by one takes longer.
 @jax.jit
 def _beam_direction(zenith: Float[Array, ""], azimuth: Float[Array, ""]) -> Float[Array, "3"]:
@@ -111,8 +121,9 @@ class Lidar(eqx.Module):
     - `altitude`: height of the sensor above the reference plane z = 0 in m, positive. Default 1000. The
       field is None where `sensor` is given.
     - `pulse`: shape of the transmitted pulse, an `AbstractPulse`. Default `GaussianPulse(fwhm=6.0)`.
-    - `divergence`: full angle of the beam in mrad, not negative. For a Gaussian beam it is measured between
-      the directions at 1/e^2 of the axial irradiance, for a top-hat across the disc. Default 0.3.
+    - `divergence`: full angle of the beam in mrad, in [0, 300]: the diameter of the footprint over the range,
+      for small angles. For a Gaussian beam it is measured between the directions at 1/e^2 of the axial
+      irradiance, for a top-hat across the disc. Default 0.3.
     - `aperture`: diameter of the receiver in m, positive. Default 0.2.
     - `zenith`: angle between the beam and straight down (nadir) in degrees, in [0, 89]; with `sensor` in
       [0, 180], where 90 is level and 180 straight up. Default 0.
@@ -124,7 +135,8 @@ class Lidar(eqx.Module):
     - `position`: (x, y) in m where the beam axis meets the reference plane: the centre of the footprint. At
       nadir it is also the sensor's horizontal position. Where `sensor` is given, this field holds that
       instead. Default (0, 0).
-    - `field_of_view`: full angle of the receiver's field of view in mrad, positive. Default None: no limit.
+    - `field_of_view`: full angle of the receiver's field of view in mrad, positive; from 3142 on it is the
+      half-space. Default None: no limit.
     - `jitter`: standard deviation of the timing error in ns, not negative. Default 0.
     - `efficiency`: of the optics and the detector together, in (0, 1], one number or one per wavelength.
       Default 1.
@@ -183,7 +195,7 @@ class Lidar(eqx.Module):
     _ranges: ClassVar = {
         "wavelength": Range(0.0, low_open=True, increasing=True),
         "altitude": Range(0.0, low_open=True),
-        "divergence": Range(0.0),
+        "divergence": Range(0.0, _MAX_DIVERGENCE),
         "aperture": Range(0.0, low_open=True),
         "zenith": Range(0.0, _MAX_ZENITH, mirrored=True),
         "azimuth": Range(),
@@ -335,6 +347,12 @@ class Lidar(eqx.Module):
         itself the footprint is longer by 1/cos(zenith) along the azimuth.
         """
         return self.range_to_reference * self.divergence * 0.5e-3
+
+    @property
+    def view_radius(self) -> Float[Array, ""] | None:
+        """Radius in m of the field of view at the aim point, across the beam; None without limit."""
+        field = self.field_of_view
+        return None if field is None else self.range_to_reference * tan_half(field)
 
     @property
     def aperture_area(self) -> Float[Array, ""]:

@@ -19,7 +19,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
-from jaxlidar._checks import as_numpy, check_choice, check_number, concrete
+from jaxlidar._checks import as_numpy, check_choice, check_number, concrete, warn_unit
 
 # Largest angle between a beam and the vertical, degrees.
 MAX_ZENITH = 89.0
@@ -168,6 +168,9 @@ class Conical(AbstractScan):
 
 def _check_pattern(half_angle: Any, field: str, rate: Any) -> None:
     check_number("half_angle", half_angle, 0.0, MAX_ZENITH, low_open=True)
+    # Smaller ones than of any radian are deliberate, as of a beam that stands still.
+    if float(half_angle) > 0.01:
+        warn_unit("half_angle", half_angle)
     check_number(field, rate, 0.0, low_open=True)
 
 

@@ -29,6 +29,7 @@ from jaxlidar._checks import (
     check_range,
     concrete_array,
     concrete_number,
+    warn_unit,
 )
 from jaxlidar._memory import format_bytes, machine_memory
 from jaxlidar._text import number_text
@@ -418,6 +419,7 @@ class Survey(eqx.Module):
         first, forward, _, length = _line(start, end)
         check_number("speed", speed, 0.0, low_open=True)
         check_number("pulse_rate", pulse_rate, 0.0, low_open=True)
+        warn_unit("pulse_rate", pulse_rate)
         check_number("gps_time", gps_time)
         shots = _count_along(length, float(speed) / float(pulse_rate))
         rate = f"pulse_rate = {float(pulse_rate):g} at speed = {float(speed):g}"
@@ -500,6 +502,7 @@ class Survey(eqx.Module):
             check_kind("trajectory", strip, Trajectory, "a Trajectory, or a sequence of them")
         if pulse_rate is not None:
             check_number("pulse_rate", pulse_rate, 0.0, low_open=True)
+            warn_unit("pulse_rate", pulse_rate)
         scanner_turn = rotation_matrix(*three_numbers("mounting", mounting))
         arm = three_numbers("lever_arm", lever_arm)
         durations = [float(strip.time[-1] - strip.time[0]) for strip in strips]

@@ -25,11 +25,13 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
-from jaxlidar._checks import as_numpy, check_range
+from jaxlidar._checks import UnitWarning, as_numpy, check_range, warn_user
 from jaxlidar._text import number_text
 
 # Courses of two positions that are nearer to one another than this, m, are not defined.
 _LEAST_STEP = 1e-6
+# Roll and pitch, rad, of an aircraft are below the first, headings within the second.
+_MAX_TILT, _FULL_TURN = 0.6, 6.3
 
 
 @final
@@ -50,6 +52,8 @@ class Trajectory(eqx.Module):
 
     **Raises:** ValueError for arrays of other shapes, values that are not finite or outside their ranges, and
     times that do not increase strictly; TypeError for what is not numbers.
+
+    **Warns:** `UnitWarning` for angles that look like radians: roll and pitch below 0.6, yaw below 6.3.
 
     **Example:**
 
@@ -87,6 +91,8 @@ class Trajectory(eqx.Module):
         self.roll = _angle("roll", roll, times.size)
         self.pitch = _angle("pitch", pitch, times.size, 90.0)
         self.yaw = _course(positions) if yaw is None else _angle("yaw", yaw, times.size)
+        if yaw is not None:
+            self._warn_radians()
 
     def __len__(self) -> int:
         return self.time.size
@@ -115,7 +121,20 @@ class Trajectory(eqx.Module):
         x, y, z, roll, pitch, yaw = (np.interp(times, self.time, column) for column in columns)
         # Unwrapped angles may exceed a turn, as 361 degrees after a heading of 359.
         roll, yaw = np.fmod(roll, 360.0), np.fmod(yaw, 360.0)
-        return Trajectory(times, np.stack([x, y, z], axis=-1), roll, pitch, yaw)
+        fields = (times, np.stack([x, y, z], axis=-1), roll, pitch, yaw)
+        # Not by the constructor, which would warn again of radians.
+        return eqx.tree_at(lambda t: (t.time, t.position, t.roll, t.pitch, t.yaw), self, fields)
+
+    def _warn_radians(self) -> None:
+        """Warn of angles that look like radians: headings within a turn of them, and a small attitude."""
+        tilt = max(np.abs(self.roll).max(), np.abs(self.pitch).max())
+        turn = np.abs(self.yaw).max()
+        if 0.0 < tilt < _MAX_TILT and 0.0 < turn < _FULL_TURN:
+            warn_user(
+                f"roll, pitch and yaw are at most {turn:.3g} degrees. Are they given in rad? Then use "
+                "numpy.rad2deg",
+                UnitWarning,
+            )
 
     @property
     def rotation(self) -> Float[np.ndarray, "n 3 3"]:

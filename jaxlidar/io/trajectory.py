@@ -2,15 +2,18 @@
 
 import os
 import re
+import warnings
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
+from jaxlidar._checks import UnitWarning
+from jaxlidar._columns import warn_unread_columns
 from jaxlidar.instrument.trajectory import Trajectory
 from jaxlidar.io.checks import MAX_COORDINATE
-from jaxlidar.io.coordinates import metric_system, unit_angle, unit_length
+from jaxlidar.io.coordinates import metric_system, system_of_name, unit_angle, unit_length, units_agree
 from jaxlidar.io.text import parse_number, read_lines, split_cells
 
 # Names of columns in files, without case, spaces, underscores and units.
@@ -44,16 +47,22 @@ _OTHER_TIME = re.compile(
     r"|^(tai|sod|tod)$"
 )
 _NAME_AND_UNIT = re.compile(r"\s*(.*?)\s*([\[(][^\])]*[\])])?\s*$")
+# A comment that names a unit of length or a reference system.
+_COMMENT = re.compile(r"\s*#\s*(crs|srs|units?)\s*[:=]\s*(.*?)\s*$", re.IGNORECASE)
 # Half the length, m, of the line along the grid's north whose true direction is taken.
 _HALF_BASELINE = 50.0
 
 
 class _Column(NamedTuple):
-    """A column of the table: its index, its name in the file, and its unit in units of the trajectory."""
+    """A column of the table: its index, its name in the file, and its unit in units of the trajectory.
+
+    `is_declared`: True if the file names the unit beside the name.
+    """
 
     index: int
     name: str
     unit: float
+    is_declared: bool
 
 
 def read_trajectory(path: str | os.PathLike[str], *, crs: str | None = None) -> Trajectory:
@@ -65,7 +74,9 @@ def read_trajectory(path: str | os.PathLike[str], *, crs: str | None = None) -> 
       open with "#", or else the last one that does, names the columns, in any order and case, with spaces or
       underscores, and with a unit in brackets where it is not the usual one: GPS time in s, as time, GPSTime
       or SOW; x or easting, y or northing, and z, height or altitude in m; roll, pitch, and yaw or heading in
-      degrees. Further columns are not read. Without roll and pitch these are zero; without yaw the platform
+      degrees. Comments such as "# units: feet" and "# crs: EPSG:2263" name the unit of lengths without one.
+      Further columns are not read; a `UserWarning` names those that nearly have the name of one that is
+      missing. Without roll and pitch these are zero; without yaw the platform
       heads along its course.
     - `crs`: a map's coordinate reference system in metres, such as "EPSG:32633". Columns longitude and
       latitude, on WGS 84, are projected to it, and headings, which are from true north, turned to the map's;
@@ -94,13 +105,16 @@ def read_trajectory(path: str | os.PathLike[str], *, crs: str | None = None) -> 
     head, delimiter, columns = _header(path, lines)
     location, n_columns = f"{path}: line {head + 1}", len(_cells(path, head + 1, lines[head], delimiter))
     is_geographic = "longitude" in columns
-    if is_geographic and crs is None:
-        raise ValueError(f"{location}: longitude and latitude; give crs, the map that they are projected to")
     # A heading from true north beside longitude and latitude need not say so.
     is_true = "yaw" in columns and "true" in _plain(columns["yaw"].name)
     if is_true and crs is None:
         name = columns["yaw"].name
         raise ValueError(f"{location}: {name!r} is from true north; give crs, the map of x and y")
+    lengths, declared_crs = _declared_in_comments(path, lines, is_geographic, columns)
+    if is_geographic and crs is None:
+        crs = declared_crs
+    if is_geographic and crs is None:
+        raise ValueError(f"{location}: longitude and latitude; give crs, the map that they are projected to")
     if crs is not None and not is_geographic and not is_true:
         raise ValueError(
             f"{location}: crs is given, but the columns are x and y, and no heading is named as one from "
@@ -116,6 +130,8 @@ def read_trajectory(path: str | os.PathLike[str], *, crs: str | None = None) -> 
     if not rows:
         raise ValueError(f"{path}: line {len(lines)}: there is no row in the file")
     values = dict(zip(columns, np.array(rows).T))
+    for name, length in lengths.items():
+        values[name] = values[name] * length
     for name in ("x", "y", "z"):
         if name in values and np.any(np.abs(values[name]) > MAX_COORDINATE):
             row = int(np.argmax(np.abs(values[name]) > MAX_COORDINATE))
@@ -128,8 +144,15 @@ def read_trajectory(path: str | os.PathLike[str], *, crs: str | None = None) -> 
         # 359.9 degrees from true north may be 361 from the map's.
         yaw = np.fmod(yaw - _direction_of_north(crs, values["x"], values["y"]), 360.0)
     position = np.stack([values[axis] for axis in "xyz"], axis=-1)
+    angles = [columns[name] for name in ("roll", "pitch", "yaw") if name in columns]
     try:
-        return Trajectory(values["time"], position, values.get("roll", 0.0), values.get("pitch", 0.0), yaw)
+        with warnings.catch_warnings():
+            if any(column.is_declared for column in angles):
+                # Angles whose unit the file names are what they are.
+                warnings.simplefilter("ignore", UnitWarning)
+            return Trajectory(
+                values["time"], position, values.get("roll", 0.0), values.get("pitch", 0.0), yaw
+            )
     except ValueError as error:
         raise ValueError(f"{path}: line {numbers[0]} and following: {error}") from error
 
@@ -143,6 +166,8 @@ def _header(path: Path, lines: list[str]) -> tuple[int, str, dict[str, _Column]]
     # A table may name its columns in a comment: then the first other line has numbers alone.
     if head > 0 and re.fullmatch(r"[-+\d.eE,;\s]+", lines[head]):
         head -= 1
+        while head > 0 and _COMMENT.match(lines[head]):
+            head -= 1
         lines[head] = lines[head].lstrip().lstrip("#")
     delimiter = max(",;\t ", key=lambda d: (lines[head].count(d) > 0, d != " ", lines[head].count(d)))
     names = [_NAME_AND_UNIT.match(cell) for cell in _cells(path, head + 1, lines[head], delimiter)]
@@ -161,14 +186,65 @@ def _header(path: Path, lines: list[str]) -> tuple[int, str, dict[str, _Column]]
             )
         if matches:
             index, name, unit = matches[0]
-            columns[quantity] = _Column(index, name, _unit(f"{path}: line {head + 1}", quantity, name, unit))
+            size = _unit(f"{path}: line {head + 1}", quantity, name, unit)
+            columns[quantity] = _Column(index, name, size, unit is not None)
     if "time" not in columns and other_times:
         raise ValueError(
             f"{path}: line {head + 1}: {other_times[0]!r} is not GPS time; admissible is a column of GPS "
             f"time, whose name may be {', '.join(_NAMES['time'])}"
         )
+    read = {column.index for column in columns.values()}
+    unread = [match[0].strip() for i, match in enumerate(names) if match is not None and i not in read]
+    missing = {quantity: known for quantity, known in _NAMES.items() if quantity not in columns}
+    for pair in (("x", "y"), ("longitude", "latitude")):
+        if set(pair) <= set(columns):
+            # The other pair is not missing.
+            missing = {
+                q: known for q, known in missing.items() if q not in ("x", "y", "longitude", "latitude")
+            }
     _check_columns(f"{path}: line {head + 1}", columns)
+    warn_unread_columns(f"{path}: line {head + 1}", unread, missing)
     return head, delimiter, columns
+
+
+def _declared_in_comments(
+    path: Path, lines: list[str], is_geographic: bool, columns: dict[str, _Column]
+) -> tuple[dict[str, float], str | None]:
+    """Return the metres per unit of columns of lengths, and the system, that comments of a file declare.
+
+    Comments are as "# units: feet" and "# crs: EPSG:2263". A unit beside the name of a column goes before
+    them. A system of the Earth's own, as EPSG:4326, is that of longitude and latitude, and is not returned.
+
+    **Raises:** ValueError for several units or systems, a unit beside a system of another, and degrees where
+    the columns are x and y.
+    """
+    declared: dict[str, tuple[str, str]] = {}
+    for number, line in enumerate(lines, 1):
+        if comment := _COMMENT.match(line):
+            name = "crs" if comment[1].lower() in ("crs", "srs") else "units"
+            location = f"{path}: line {number}"
+            if declared.setdefault(name, (location, comment[2]))[1] != comment[2]:
+                raise ValueError(f"{location}: {comment[2]!r} after {declared[name][1]!r}; admissible is one")
+    horizontal = vertical = None
+    crs = None
+    if "crs" in declared:
+        system = system_of_name(declared["crs"][0] + ": crs", declared["crs"][1])
+        if is_geographic:
+            crs = declared["crs"][1] if system.kind == "map" else None
+        else:
+            horizontal, vertical = system.lengths(declared["crs"][0])
+    if "units" in declared:
+        location, text = declared["units"]
+        unit = unit_length(location, text)
+        if horizontal is not None and unit is not None and not units_agree(horizontal, unit):
+            raise ValueError(f"{location}: {text}, but the system {declared['crs'][1]} is in another unit")
+        horizontal = vertical = unit
+    sizes = {"x": horizontal, "y": horizontal, "z": vertical}
+    return {
+        name: size
+        for name, size in sizes.items()
+        if size is not None and name in columns and not columns[name].is_declared
+    }, crs
 
 
 def _plain(name: str) -> str:

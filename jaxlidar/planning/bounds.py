@@ -46,7 +46,7 @@ from jaxlidar._checks import concrete_array, concrete_number
 from jaxlidar._constants import SPEED_OF_LIGHT
 from jaxlidar._vectors import Vec, scale, vec
 from jaxlidar.instrument.field_of_view import visible_fraction
-from jaxlidar.instrument.lidar import Lidar
+from jaxlidar.instrument.lidar import Lidar, tan_half
 from jaxlidar.optics.facets import FACET_BACKSCATTER
 from jaxlidar.optics.laws import AbstractLaw, AbstractMirror
 from jaxlidar.optics.phase import AbstractPhase
@@ -629,8 +629,7 @@ def footprint_rays(lidar: Lidar) -> tuple[Rays, PerRay]:
     rays = (axis * slant_range + r[:, None, None] * circle).reshape(-1, 3)
     visible = np.ones_like(r)
     if lidar.field_of_view is not None:
-        # The full angle is in mrad.
-        view_radius = slant_range * concrete_number(lidar.field_of_view) * 0.5e-3
+        view_radius = slant_range * tan_half(concrete_number(lidar.field_of_view), np)
         visible = visible_fraction(r / view_radius, np)
     return rays / np.linalg.norm(rays, axis=1)[:, None], np.repeat(visible, turn.size)
 

@@ -14,7 +14,14 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
-from jaxlidar._checks import array_namespace, concrete_array, concrete_number, fixed_array, is_traced
+from jaxlidar._checks import (
+    array_namespace,
+    concrete,
+    concrete_array,
+    concrete_number,
+    fixed_array,
+    is_traced,
+)
 from jaxlidar._vectors import FAR, vec
 from jaxlidar.instrument.lidar import AIM_DISTANCE, Lidar
 from jaxlidar.instrument.survey import Survey
@@ -30,6 +37,10 @@ from jaxlidar.scenes.terrain import Terrain
 # Least distance, m, of a sensor from a surface, and least angle, degrees, of its beam from the level within a
 # canopy that has no sides.
 LEAST_CLEARANCE, LEAST_ELEVATION = 1e-3, 1.0
+# Distance of a canopy or a mesh from all beams, m, beyond which it is in another place.
+FARTHEST_SCENE = 1e5
+# Pairs of a sensor and a triangle whose distance is looked at.
+_SENSOR_TRIANGLE_PAIRS = 30_000_000
 # Beams at a smaller angle, degrees, to a plane meet it beyond the record, which they would make endless.
 LEAST_GRAZING_ANGLE = 0.5
 # A flight crosses at most so many voxels, because a batch waits for its longest flight.
@@ -416,18 +427,22 @@ def misplaced_sensors(shots: Survey | TracedBeam, scene: Scene) -> Iterator[tupl
 
 
 def check_sensors(shots: Survey, scene: Scene) -> None:
-    """Refuse sensors below the ground or in a plate, and level beams within a canopy that has no sides.
+    """Refuse sensors below the ground, in a plate or a triangle, and level beams in a canopy without sides.
 
     **Raises:** ValueError with the shot and the numbers.
     """
     sensor, which = shots.sensor, "" if len(shots) == 1 else f" of shot {{}} of {len(shots)}"
+    for surface in scene.surfaces:
+        if isinstance(surface, MeshMaterial) and surface.mesh.surfaces[0].name == surface.name:
+            _check_clear_of_triangles(shots, surface.mesh)
     for where, height, is_bad in misplaced_sensors(shots, scene):
         if not is_bad.any():
             continue
         i = int(np.argmax(is_bad))
         if where != "level":
             raise ValueError(
-                f"sensor{which.format(i)} = {[round(float(x), 3) for x in sensor[i]]} is {where}, "
+                # Of a scene that was moved to its local origin the height alone is the user's.
+                f"sensor{which.format(i)} at the height {sensor[i, 2]:.9g} m is {where}, "
                 f"{float(height[i]):.3g} m above it; admissible is more than {LEAST_CLEARANCE:g} m"
             )
         raise ValueError(
@@ -435,6 +450,56 @@ def check_sensors(shots: Survey, scene: Scene) -> None:
             f"sides, which a level beam never leaves; admissible is {LEAST_ELEVATION:g} degree or more "
             "from 90, or sides = 'open'"
         )
+
+
+def _check_clear_of_triangles(shots: Survey, mesh: MeshSurface) -> None:
+    """Refuse a sensor in a triangle: by rounding it would be on either side.
+
+    Sensors outside of the boxes of all instances are clear. Where many are within, as of a vehicle in a city,
+    so many pairs are looked at that it takes about a second.
+
+    **Raises:** ValueError with the shot.
+    """
+    if any(is_traced(x) for x in jax.tree.leaves(mesh)):
+        return
+    sensor, shot = np.unique(shots.sensor, axis=0, return_index=True)
+    boxes = mesh.bounds()
+    boxes = np.stack([boxes[:, 0] - LEAST_CLEARANCE, boxes[:, 1] + LEAST_CLEARANCE], axis=1)
+    is_within = ((sensor > boxes[:, 0].min(axis=0)) & (sensor < boxes[:, 1].max(axis=0))).all(axis=1)
+    n_pairs, corners = 0, None
+    for i in np.flatnonzero(is_within):
+        around = ((sensor[i] > boxes[:, 0]) & (sensor[i] < boxes[:, 1])).all(axis=1)
+        for instance in np.flatnonzero(around):
+            if n_pairs > _SENSOR_TRIANGLE_PAIRS:
+                return
+            corners = mesh.local_corners() if corners is None else corners
+            n_pairs += len(corners)
+            local, scale = mesh.to_local(sensor[i], int(instance))
+            clearance = LEAST_CLEARANCE / scale
+            low, high = corners.min(axis=1) - clearance, corners.max(axis=1) + clearance
+            near = corners[((local > low) & (local < high)).all(axis=1)]
+            if len(near) and _distance_to_triangles(local, near).min() < clearance:
+                which = "" if len(shots) == 1 else f" of shot {shot[i]} of {len(shots)}"
+                raise ValueError(
+                    f"sensor{which} at the height {sensor[i, 2]:.9g} m is in a triangle of a mesh; "
+                    f"admissible is more than {LEAST_CLEARANCE:g} m from it"
+                )
+
+
+def _distance_to_triangles(
+    point: Float[np.ndarray, "3"], corners: Float[np.ndarray, "n 3 3"]
+) -> Float[np.ndarray, " n"]:
+    """Return the distances of a point from triangles: from their planes where it is over them, else edges."""
+    start, edge = corners, np.roll(corners, -1, axis=1) - corners
+    normal = np.cross(edge[:, 0], edge[:, 1])
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    inward = np.cross(normal[:, None], edge)
+    is_over = (np.sum((point - start) * inward, axis=2) >= 0).all(axis=1)
+    to_plane = np.abs(np.sum((point - start[:, 0]) * normal, axis=1))
+    length = np.maximum(np.sum(edge * edge, axis=2), 1e-300)
+    along_edge = np.clip(np.sum((point - start) * edge, axis=2) / length, 0.0, 1.0)
+    to_edges = np.linalg.norm(point - start - along_edge[..., None] * edge, axis=2).min(axis=1)
+    return np.where(is_over, to_plane, to_edges)
 
 
 def _height_above(surface: AbstractSurface, sensor: Any) -> Any:
@@ -573,6 +638,37 @@ def footprint_is_off_terrain(lidar: Lidar, scene: Scene) -> Any:
     # Rounding of single precision.
     slack = 1e-5 * (end - origin)
     return jnp.any((box[0] < origin - slack) | (box[1] > end + slack))
+
+
+def check_scene_near_beams(shots: Lidar | Survey, scene: Scene) -> None:
+    """Refuse a canopy or a mesh that is hundreds of kilometres away from all beams: its map is another one.
+
+    Distances are those of the axes of beams from a sphere around everything.
+
+    **Raises:** ValueError with the distance.
+    """
+    survey = shots if isinstance(shots, Survey) else Survey.of(shots)
+    boxes: dict[str, Any] = {}
+    if scene.canopy is not None and scene.canopy.sides == "open":
+        voxels = scene.canopy.voxels
+        boxes["canopy"] = [concrete(a) for a in (voxels.origin, voxels.top)]
+    if scene.period is None:
+        for i, mesh in enumerate(scene.meshes):
+            if not any(is_traced(x) for x in jax.tree.leaves(mesh)):
+                bounds = mesh.bounds()
+                boxes[f"meshes[{i}]"] = [bounds[:, 0].min(axis=0), bounds[:, 1].max(axis=0)]
+    for name, (low, high) in boxes.items():
+        if low is None or high is None:
+            continue
+        offset = 0.5 * (low + high) - survey.aim_point
+        along_beam = np.sum(offset * survey.direction, axis=1, keepdims=True)
+        to_axes = np.linalg.norm(offset - along_beam * survey.direction, axis=1)
+        distance = float(to_axes.min()) - 0.5 * float(np.linalg.norm(high - low))
+        if distance > FARTHEST_SCENE:
+            raise ValueError(
+                f"{name} is {1e-3 * distance:.4g} km away from every beam; admissible is up to "
+                f"{1e-3 * FARTHEST_SCENE:g} km: are its coordinates those of another map?"
+            )
 
 
 def check_footprints_on_terrain(shots: Lidar | Survey, scene: Scene) -> None:

@@ -61,6 +61,7 @@ from jaxlidar.planning.parallel_light import beams_are_parallel, parallel_light_
 from jaxlidar.planning.path_lengths import (
     PathLengths,
     check_footprints_on_terrain,
+    check_scene_near_beams,
     longest_segment,
     meshes_are_in_reach,
 )
@@ -290,8 +291,9 @@ def plan(
     plates both reflect and transmit (weights of single precision), for a scene that reaches up to the
     altitude of the sensor, for a `Lidar(sensor=)` below the ground, in a plate, less than 1 degree from the
     level within a canopy with periodic sides, or in air with a lidar ratio, for a footprint that lies partly
-    off the terrain, for what would take more memory than `max_memory`, and if the geometry is being traced by
-    a JAX transformation: make the plan outside and pass it in.
+    off the terrain, for a canopy or a mesh that is more than 100 km away from every beam, for what would take
+    more memory than `max_memory`, and if the geometry is being traced by a JAX transformation: make the plan
+    outside and pass it in.
 
     **Example:**
 
@@ -317,7 +319,9 @@ def plan(
         check_range("max_memory", max_memory, 0.0, low_open=True)
     check_choice("footprint", footprint, ("random", "fixed"))
     check_kind("histories", histories, bool | None, "True, False or None")
-    check_footprints_on_terrain(lidar if survey is None else survey, scene)
+    shots = lidar if survey is None else survey
+    check_footprints_on_terrain(shots, scene)
+    check_scene_near_beams(shots, scene)
     air = scene.atmosphere
     if lidar.has_sensor_position and air is not None and air.lidar_ratio is not None:
         raise ValueError(

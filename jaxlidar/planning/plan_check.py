@@ -86,7 +86,8 @@ def is_in_reach(plan: Plan, lidar: Lidar, scene: Scene) -> Bool[Array, ""]:
 
 def _is_free_of(checks: Sequence[Callable], plan: Plan, lidar: Lidar, scene: Scene) -> Bool[Array, ""]:
     arrays, static = eqx.partition((lidar, scene), eqx.is_array)
-    arrays = jax.tree.map(jax.lax.stop_gradient, arrays)
+    # Where a derivative is taken by a Python number, that number remains of it.
+    arrays = jax.tree.map(lambda a: jnp.asarray(jax.lax.stop_gradient(a)), arrays)
     # NumPy's rules of broadcasting, by which both evaluate.
     with jax.numpy_rank_promotion("allow"):
         lidar, scene = eqx.combine(arrays, static)

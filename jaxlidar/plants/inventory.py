@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxlidar._checks import check_integer, check_kind, check_seed, kind_of
+from jaxlidar._columns import warn_unread_columns
 from jaxlidar.plants.forest import MAX_TREE_HEIGHT
 from jaxlidar.plants.habits import Habit, broadleaf, conifer, grow, shrub, spreading_tree
 from jaxlidar.plants.stand import Stand
@@ -94,7 +95,8 @@ def stand_from_inventory(
       as a dict of lists or a pandas DataFrame. It has columns x, y and height, and may have species, z,
       diameter (also dbh), crown (crown diameter) and leaf_area, under these names in any case. Lengths are in
       m, or in the unit that the name of the column ends with, as in "dbh [cm]" or "dbh_cm"; leaf areas in m2.
-      Diameters and crowns may be NaN. Other columns are not read.
+      Diameters and crowns may be NaN. Other columns are not read; a `UserWarning` names those that nearly
+      have one of these names.
     - `habits`: the habit of each species by name, or one `Habit` for all. Default None: the species
       broadleaf, conifer, shrub and spreading_tree; without a column of species, `broadleaf()`.
     - `leaf_area_index`: one-sided leaf area per ground area, 0 or more, which is divided among the trees by
@@ -206,7 +208,10 @@ def inventory_of_table(table: Any, place_of: Callable[[int], str] = "row {}".for
             f"inventory is {kind_of(table)}; admissible is a table by columns, such as a dict of lists, a "
             "DataFrame, or what jaxlidar.io.read_inventory returns"
         )
-    names, units = _columns_in_use([str(name) for name in table.keys()])  # noqa: SIM118
+    table_names = [str(name) for name in table.keys()]  # noqa: SIM118
+    names, units = _columns_in_use(table_names)
+    missing = {quantity: known for quantity, known in _NAMES.items() if quantity not in names}
+    warn_unread_columns("the inventory", [n for n in table_names if n not in names.values()], missing)
     labels = {str(label): label for label in table.keys()}  # noqa: SIM118
     cells = {quantity: list(table[labels[name]]) for quantity, name in names.items()}
     n = len(cells["x"])

@@ -61,6 +61,8 @@ MAX_TRIANGLES = 1 << 28
 # Slack of the boxes of instances, in units of the floating-point precision and of their coordinates: rays are
 # transformed to coordinates of the mesh with rounding.
 _INSTANCE_ROUNDING = 16.0
+# Largest rounding of a corner: in units of the longest edge of its triangle, if it is more than so many m.
+_EDGE_ROUNDING, _LEAST_ROUNDING = 0.01, 1e-4
 # Rounding of a point on a triangle, in units of the floating-point precision and of its coordinates.
 _POSITION_ROUNDING = 8.0
 # Periods by which copies of an instance that crosses sides of a cell lie away from it.
@@ -181,9 +183,10 @@ class MeshSurface(eqx.Module):
     you make the scene.
 
     **Raises:** ValueError for arrays of other shapes, no triangle with an area, more than 2^28 triangles,
-    positions that are not finite, indices of vertices that do not exist, optics outside [0, 1], names that
-    the mesh does not have, and a mirror; TypeError for objects of another kind and for vertices that JAX is
-    tracing: make the surface outside, and replace its `vertices` by `equinox.tree_at`.
+    positions that are not finite, triangles so small and so far from the middle of their mesh that their
+    corners are rounded by more than 1 % of their edges, indices of vertices that do not exist, optics outside
+    [0, 1], names that the mesh does not have, and a mirror; TypeError for objects of another kind and for
+    vertices that JAX is tracing: make the surface outside, and replace its `vertices` by `equinox.tree_at`.
 
     **Example:** a roof over ground.
 
@@ -243,6 +246,7 @@ class MeshSurface(eqx.Module):
         # Relative to their middle, coordinates of millions of metres lose nothing in single precision.
         self.origin = np.round(0.5 * (vertices.min(axis=0) + vertices.max(axis=0)))
         self.vertices = as_array(vertices - self.origin)
+        _check_rounding(vertices - self.origin, faces, float(jnp.finfo(self.vertices.dtype).eps))
         order = tree_order(vertices[faces])
         self.faces = faces[order].astype(np.int32)
         numbers = np.searchsorted(np.unique(group), group) if by_material else np.zeros(len(faces), int)
@@ -294,6 +298,34 @@ class MeshSurface(eqx.Module):
         vertices = concrete_array(self.vertices) + np.asarray(self.origin, float)
         placed = np.einsum("nij,vj->nvi", matrices, vertices) + concrete_array(places.shift)[:, None]
         return placed[:, faces].reshape(-1, 3, 3)
+
+    def local_corners(self) -> Float[np.ndarray, "triangles 3 3"]:
+        """Return the corners of the triangles in coordinates of the mesh, m, before copies are placed."""
+        return (concrete_array(self.vertices) + np.asarray(self.origin, float))[np.unique(self.faces, axis=0)]
+
+    def to_local(self, point: Float[np.ndarray, "3"], instance: int) -> tuple[Float[np.ndarray, "3"], float]:
+        """Return a point in coordinates of the mesh, as an instance sees it, and the scale of that."""
+        places = self.instances
+        rotation, scale = (
+            concrete_array(a)[instance : instance + 1] for a in (places.rotation, places.scale)
+        )
+        matrix = _matrices(rotation, scale, np)[0]
+        local = np.linalg.solve(matrix, point - concrete_array(places.shift)[instance])
+        return local, float(scale[0])
+
+    def gap_to_plane(self, normal: Float[np.ndarray, "3"], foot: Float[np.ndarray, "3"]) -> float:
+        """Return the distance, m, of the triangle that is nearest to a plane with all of its corners."""
+        corners, boxes, nearest = self.local_corners(), self.bounds(), np.inf
+        for instance, (low, high) in enumerate(boxes):
+            reach = 0.5 * (high - low) @ np.abs(normal) + 1.0
+            if abs((0.5 * (low + high) - foot) @ normal) > reach:
+                continue
+            # The plane in coordinates of the mesh, so that no copy of the corners is made.
+            origin, scale = self.to_local(foot, instance)
+            direction = self.to_local(foot + normal, instance)[0] - origin
+            distance = np.abs((corners - origin) @ (direction * scale)) * scale
+            nearest = min(nearest, float(distance.max(axis=1).min()))
+        return nearest
 
     def bounds(self, xp: Any = np) -> Any:
         """Return the lowest and the highest corner, m, of a box around each instance, (instances, 2, 3).
@@ -351,6 +383,29 @@ def _mesh_arrays(
     if not has_area.any():
         raise ValueError("mesh has no triangle with an area; admissible is one or more")
     return vertices, faces[has_area], group[has_area], names
+
+
+def _check_rounding(vertices: Float[np.ndarray, "m 3"], faces: Int[np.ndarray, "n 3"], eps: float) -> None:
+    """Refuse triangles whose corners are rounded by more than `_EDGE_ROUNDING` of their longest edge.
+
+    Corners are kept in single precision, unless JAX is configured otherwise, from the middle of the mesh.
+
+    **Raises:** ValueError with the triangle, its edge, its distance and the rounding.
+    """
+    distance = np.abs(vertices).max(axis=1)[faces].max(axis=1)
+    suspects = np.flatnonzero(0.5 * eps * distance > _LEAST_ROUNDING)
+    corners = vertices[faces[suspects]]
+    edge = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
+    rounding = 0.5 * eps * distance[suspects]
+    too_short = np.flatnonzero(rounding > _EDGE_ROUNDING * edge)
+    if len(too_short):
+        worst = too_short[np.argmin(edge[too_short])]
+        raise ValueError(
+            f"mesh: {len(too_short)} triangles are rounded, as one with an edge of {edge[worst]:.3g} m "
+            f"that is {distance[suspects[worst]]:.6g} m from the middle of the mesh, by "
+            f"{rounding[worst]:.2g} m; admissible is {100 * _EDGE_ROUNDING:g} % of the edge: split the mesh "
+            "into several MeshSurfaces, each around what it holds"
+        )
 
 
 def _optics_by_material(field: str, value: Any, materials: tuple[str, ...], missing: Any = None) -> Any:
@@ -461,7 +516,8 @@ def build_mesh_tree(meshes: Sequence[MeshSurface], period: Float[Array, "2"] | N
     materials, first_material = [jnp.zeros(first_row, jnp.int32)], 0
     for mesh in meshes:
         corners = mesh.vertices[mesh.faces]
-        rows, box = triangle_rows(corners)
+        group = jnp.asarray(mesh.group) + first_material
+        rows, box = triangle_rows(corners, group)
         longest = jnp.max(jnp.abs(corners - jnp.roll(corners, 1, axis=1)))
         longest_sides.append(longest * jnp.max(mesh.instances.scale))
         matrices = mesh.instances.matrices()
@@ -471,7 +527,6 @@ def build_mesh_tree(meshes: Sequence[MeshSurface], period: Float[Array, "2"] | N
         boxes.append(jnp.broadcast_to(box, (len(matrices), 2, 3)))
         numbers += [(first_row, len(mesh.faces), int(not mesh.two_sided))] * len(matrices)
         lower.append(rows)
-        group = jnp.asarray(mesh.group) + first_material
         materials.append(jnp.concatenate([jnp.zeros(len(rows) - len(group), jnp.int32), group]))
         first_row, first_material = first_row + len(rows), first_material + len(mesh.surfaces)
     matrix, shift, box = (jnp.concatenate(a) for a in (transforms, shifts, boxes))
@@ -502,7 +557,8 @@ def build_mesh_tree(meshes: Sequence[MeshSurface], period: Float[Array, "2"] | N
     upper, box = tree_rows(leaf_rows[order], low[order], high[order])
     instances = fill(jnp.asarray(numbers, jnp.int32), 0)[order]
     uniform = numbers[0] if len(set(numbers)) == 1 else None
-    tree = TriangleTree(jnp.concatenate([upper, *lower]), instances, box, uniform, period)
+    rows = jnp.concatenate([upper, *lower])
+    tree = TriangleTree(rows, instances, box, uniform, period, several_materials=first_material > 1)
     return MeshTree(
         tree,
         jnp.zeros_like(shift[0]),

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxlidar._checks import check_kind, concrete, is_traced, kind_of
+from jaxlidar._checks import check_kind, concrete, concrete_array, is_traced, kind_of
 from jaxlidar._ranges import Range
 from jaxlidar._text import object_text
 from jaxlidar._vectors import FAR
@@ -45,13 +45,14 @@ class Scene(eqx.Module):
     - `plates`: a sequence of `Plate`, or of other `AbstractSheet`. Default ().
     - `ground`: a `Ground`, a `Terrain`, another `AbstractGround`, or None. Default None.
     - `atmosphere`: an `Atmosphere`, or None. Default None.
-    - `meshes`: a sequence of `MeshSurface`. Beside a canopy or terrain with periodic sides, they repeat with
-      it; one that crosses a side enters by the opposite one. Default ().
+    - `meshes`: a sequence of `MeshSurface`. Triangles that lie in the ground are met before it; of triangles
+      in one plane, those of the mesh that comes first in the sequence. Beside a canopy or terrain with
+      periodic sides, meshes repeat with it; one that crosses a side enters by the opposite one. Default ().
 
     **Raises:** TypeError for an argument of the wrong type; ValueError for a plate in the plane of the
-    ground or of another plate, for a canopy with periodic sides over terrain of another period, for one
-    that lies below the terrain as a whole, and for meshes that are wider than the period of a canopy or
-    terrain with periodic sides, with which they repeat.
+    ground, of another plate, of a triangle or of a cell of the terrain, for a canopy with periodic sides
+    over terrain of another period, for one that lies below the terrain as a whole, and for meshes that are
+    wider than the period of a canopy or terrain with periodic sides, with which they repeat.
 
     **Warns:** `MisplacedCanopyWarning` for plants below the terrain, or far above it.
 
@@ -104,6 +105,31 @@ class Scene(eqx.Module):
                     f"{names[high]} lies {distance:.1g} m from the plane of {names[low]}: which is met first "
                     f"is unknown; admissible is {MIN_GAP:g} m or more"
                 )
+        self._check_plates()
+
+    def _check_plates(self) -> None:
+        """Refuse plates in the plane of triangles of a mesh, or of cells of a terrain.
+
+        Triangles that lie in the ground are met before it (`jaxlidar.trace.meshes`).
+        """
+        if not self.plates or any(
+            is_traced(x) for x in jax.tree.leaves((self.plates, self.ground, self.meshes))
+        ):
+            return
+        for i, plate in enumerate(self.plates):
+            if not isinstance(plate.shape, Plane):
+                continue
+            plane = concrete_array(plate.shape.upward), concrete_array(plate.shape.foot)
+            gaps = {f"meshes[{n}]": mesh.gap_to_plane(*plane) for n, mesh in enumerate(self.meshes)}
+            if isinstance(self.ground, Terrain) and self.ground.relief:
+                distance = (_corners_of_cells(self.ground) - plane[1]) @ plane[0]
+                gaps["the terrain"] = float(np.abs(distance).max(axis=1).min())
+            for name, distance in gaps.items():
+                if distance < MIN_GAP:
+                    raise ValueError(
+                        f"plates[{i}] lies {distance:.1g} m from a part of {name} in its plane: which is met "
+                        f"first is unknown; admissible is {MIN_GAP:g} m or more"
+                    )
 
     @property
     def gap(self) -> Float[Array, ""] | None:
@@ -127,6 +153,16 @@ class Scene(eqx.Module):
         """All surfaces in the order in which the tracer numbers them: ground, plates, materials of meshes."""
         ground = () if self.ground is None else (self.ground,)
         return (*ground, *self.plates, *itertools.chain(*(mesh.surfaces for mesh in self.meshes)))
+
+
+def _corners_of_cells(terrain: Terrain) -> Float[np.ndarray, "cells 4 3"]:
+    """Return the four nodes of each cell of a terrain, m."""
+    heights = concrete_array(terrain.heights)
+    numbers = np.moveaxis(np.indices(heights.shape), 0, -1)
+    places = concrete_array(terrain.origin) + numbers * concrete_array(terrain.spacing)
+    nodes = np.concatenate([places, heights[..., None]], axis=-1)
+    cells = (nodes[:-1, :-1], nodes[1:, :-1], nodes[:-1, 1:], nodes[1:, 1:])
+    return np.stack(cells, axis=2).reshape(-1, 4, 3)
 
 
 def _gaps(surfaces: tuple[AbstractSurface, ...]) -> Iterator[tuple[tuple[int, int], Float[Array, ""]]]:

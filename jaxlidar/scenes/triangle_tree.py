@@ -7,7 +7,7 @@ twelve numbers:
 
     inner node              lowest corners of the boxes of both children, then their highest corners
     leaf of the upper tree  the matrix M and the point o: a point x is M (x - o) in coordinates of the mesh
-    leaf of a lower tree    the three corners of a triangle
+    leaf of a lower tree    the three corners of a triangle, and the number of its material
 
 so that a step of a ray reads one row, whatever its node is. A ray meets the nearer child first. In place of a
 stack it carries a *trail*, a bit for each level above its node: one where the sibling must still be visited
@@ -18,6 +18,9 @@ Rays meet triangles by signed areas of their edges, seen along the ray (Woop, Be
 Comput. Graph. Tech. 2(1), 65). Neighbours compute the area of a shared edge from the same numbers. An area
 counts as zero, and so as inside, within the rounding of its corners and of their products: fused
 multiplications, by which compilers make the areas of neighbours differ, then open no gap.
+
+Where triangles of several materials lie in one plane, nearer to one another than the rounding of their
+distances, rounding would mix the materials: a ray meets the one with the lowest number.
 
 Where the scene repeats, with the period L along x and y, the upper tree holds what lies in one cell of L x L,
 whole instances: those that cross its sides lie on both. A ray is followed from cell to cell, in each with its
@@ -53,6 +56,9 @@ _LANES = 128
 _FEW = 24
 # Rounding of a signed area, in units of the floating-point precision and of its corners' coordinates.
 _AREA_ROUNDING = 2.0
+# Rounding of the distance of a triangle, in units of the floating-point precision and of coordinates, and the
+# largest rise of a triangle along a ray, over its width, by which it grows.
+_DISTANCE_ROUNDING, _MAX_RISE = 4.0, 100.0
 # Relative slack of the distances at which a ray leaves a box (Ize 2013, J. Comput. Graph. Tech. 2(2), 12).
 _BOX_ROUNDING = 8.0
 # Cells of a repeating scene through which a ray is followed: so many, that only rays which are level to one
@@ -79,6 +85,7 @@ class TriangleTree(eqx.Module):
     - `uniform`: the `Instance` of all leaves where they have the same numbers; else None.
     - `period`: those along x and y, m, of a scene that repeats: its cells have corners at multiples of these.
       None for one that does not.
+    - `several_materials`: False where all triangles have the same one.
     """
 
     table: Float[Array, "rows 12"]
@@ -86,6 +93,7 @@ class TriangleTree(eqx.Module):
     box: Float[Array, "2 3"]
     uniform: tuple[int, int, int] | None = eqx.field(static=True)
     period: Float[Array, "2"] | None = None
+    several_materials: bool = eqx.field(static=True, default=False)
 
     @property
     def n_leaves(self) -> int:
@@ -144,9 +152,12 @@ def tree_rows(
     return rows, jnp.concatenate([low, high])
 
 
-def triangle_rows(corners: Float[Array, "leaves 3 3"]) -> tuple[Float[Array, "rows 12"], Float[Array, "2 3"]]:
-    """Return the rows of the tree of a mesh, and its bounding box; `corners` in the order of the leaves."""
-    leaf_rows = jnp.pad(corners.reshape(-1, 9), ((0, 0), (0, ROW - 9)))
+def triangle_rows(
+    corners: Float[Array, "leaves 3 3"], material: Int[Array, "leaves"]
+) -> tuple[Float[Array, "rows 12"], Float[Array, "2 3"]]:
+    """Return the rows of the tree of a mesh, and its bounding box; triangles in the order of the leaves."""
+    numbers = jnp.stack([material.astype(corners.dtype)] + [jnp.zeros_like(corners[:, 0, 0])] * 2, axis=1)
+    leaf_rows = jnp.concatenate([corners.reshape(-1, 9), numbers], axis=1)
     return tree_rows(leaf_rows, jnp.min(corners, axis=1), jnp.max(corners, axis=1))
 
 
@@ -194,6 +205,8 @@ class _TreeTraversal(eqx.Module):
     - `instance`: that of the lower tree, where instances differ.
     - `distance`, `row`, `leaf`: as in `TriangleHit`; until a triangle is met, `distance` is that beyond which
       none counts, and `row` is zero.
+    - `material`, `rounding`: number of the material of that triangle, and bound on the rounding of its
+      distance, m; None where all have the same material.
     - `walk`: where the ray is in a scene that repeats; else None.
     """
 
@@ -212,6 +225,8 @@ class _TreeTraversal(eqx.Module):
     distance: Float[Array, "*lanes"]
     row: Int[Array, "*lanes"]
     leaf: Int[Array, "*lanes"]
+    material: Float[Array, "*lanes"] | None
+    rounding: Float[Array, "*lanes"] | None
     walk: _CellWalk | None
 
 
@@ -289,6 +304,8 @@ def nearest_triangle(
             distance=distance,
             row=zero,
             leaf=zero,
+            material=jnp.zeros_like(distance) if tree.several_materials else None,
+            rounding=jnp.zeros_like(distance) if tree.several_materials else None,
             walk=walk,
         )
 
@@ -409,7 +426,7 @@ def _visit_node(tree: TriangleTree, s: _TreeTraversal, any_hit: bool, precision:
     1. Read the row of the node.
     2. Of an inner node, intersect both boxes, and go on to the nearer one; the trail notes the other.
     3. Of an instance, transform the ray, and go on to the root of its tree.
-    4. Of a triangle, intersect it.
+    4. Of a triangle, intersect it. Of two in one plane, keep that with the lower number of material.
     5. Where nothing below is met, go on to the next node of the trail; at the end of a lower tree, to that of
        the upper tree; at the end of the latter, stop.
     6. Where the scene repeats and nothing was met, begin again in the next cell.
@@ -428,9 +445,9 @@ def _visit_node(tree: TriangleTree, s: _TreeTraversal, any_hit: bool, precision:
     )
     # 2. Boxes beyond the nearest triangle so far are not met.
     inverse = _inverse(direction)
+    reach = s.distance if s.rounding is None else s.distance + s.rounding
     boxes = [
-        _box_distance(row[k : k + 3], row[k + 6 : k + 9], start, inverse, s.distance, precision)
-        for k in (0, 3)
+        _box_distance(row[k : k + 3], row[k + 6 : k + 9], start, inverse, reach, precision) for k in (0, 3)
     ]
     # Each number of the next state follows from these: without `once` the compiler repeats them in all.
     (first_met, first_near), (second_met, second_near) = once(boxes)
@@ -445,8 +462,19 @@ def _visit_node(tree: TriangleTree, s: _TreeTraversal, any_hit: bool, precision:
         entered = [tree.instances.at[leaf, k].get(mode="promise_in_bounds") for k in range(3)]
         next_instance = Instance(*(jnp.where(enters, a, b) for a, b in zip(entered, s.instance)))
     # 4.
-    distance = once(_triangle_distance(row, start, direction, instance.one_sided, precision))
-    is_nearer = s.active & s.inside & is_leaf & (distance < s.distance)
+    distance, rounding = _triangle_distance(row, start, direction, instance.one_sided, precision)
+    if s.material is None or s.rounding is None:
+        distance = once(distance)
+        is_nearer = s.active & s.inside & is_leaf & (distance < s.distance)
+        material = nearest_rounding = None
+    else:
+        distance, rounding = once((distance, rounding))
+        # Zero for the same material, and where nothing has been met.
+        order = jnp.where(s.row > 0, jnp.sign(s.material - row[9]), 0.0)
+        farthest = s.distance + order * (s.rounding + rounding)
+        is_nearer = s.active & s.inside & is_leaf & (distance < farthest)
+        material = jnp.where(is_nearer, row[9], s.material)
+        nearest_rounding = jnp.where(is_nearer, rounding, s.rounding)
     nearest = jnp.where(is_nearer, distance, s.distance)
     # 5.
     next_node, next_trail, has_ended = _next_on_trail(node, trail)
@@ -475,6 +503,8 @@ def _visit_node(tree: TriangleTree, s: _TreeTraversal, any_hit: bool, precision:
         distance=nearest,
         row=next_row,
         leaf=jnp.where(is_nearer, leaf, s.leaf),
+        material=material,
+        rounding=nearest_rounding,
         walk=s.walk,
     )
     if s.walk is None:
@@ -570,8 +600,10 @@ def _box_distance(
     return enter <= leave * (1.0 + _BOX_ROUNDING * precision), enter
 
 
-def _triangle_distance(row: list[Scalar], x: Vec, w: Vec, one_sided: Array | int, precision: float) -> Scalar:
-    """Return the distance along rays to triangles, FAR where they are missed (see the module)."""
+def _triangle_distance(
+    row: list[Scalar], x: Vec, w: Vec, one_sided: Array | int, precision: float
+) -> tuple[Scalar, Scalar]:
+    """Return the distance along rays to triangles, FAR where they are missed, and a bound on its rounding."""
     size = [jnp.abs(a) for a in w]
     z_largest = (size[2] >= size[0]) & (size[2] >= size[1])
     x_largest = ~z_largest & (size[0] >= size[1])
@@ -619,4 +651,10 @@ def _triangle_distance(row: list[Scalar], x: Vec, w: Vec, one_sided: Array | int
     is_met = (is_inside | is_inside_reversed) & has_area & (distance > 0)
     # With corners counter-clockwise as seen from the side of light, `total` has the sign of the direction.
     is_met &= (one_sided == 0) | (total * along_last > 0)
-    return jnp.where(is_met, distance, FAR)
+    # Corners are rounded, and so is where the ray meets the triangle: more by the rise of that along the ray.
+    coordinates = sum((jnp.abs(v) for v in (*row[:3], *x)), start=jnp.zeros_like(total))
+    across = corners[0][1] + corners[1][1] + corners[2][1]
+    rise = (highest - lowest) * across / jnp.where(has_area, jnp.abs(total), 1.0)
+    rise = jnp.minimum(rise, _MAX_RISE * jnp.abs(inverse))
+    rounding = _DISTANCE_ROUNDING * precision * coordinates * (jnp.abs(inverse) + rise)
+    return jnp.where(is_met, distance, FAR), rounding

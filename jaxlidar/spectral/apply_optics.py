@@ -14,8 +14,8 @@ mean over a pulse that is long beside the range, energies would be too large.
 """
 
 import dataclasses
-from collections.abc import Callable
-from typing import NamedTuple
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -47,6 +47,11 @@ from jaxlidar.trace.response import Response
 MIN_WAVELENGTHS = 4
 # More wavelengths than this are a spectrum: standard errors are computed at pivot wavelengths.
 MAX_EXACT_WAVELENGTHS = 16
+
+# By how much an energy budget may sum to more than 1 and its errors. Rounding makes up to 1e-6 of it.
+# Footprints that share light leave out the faintest coefficients of their splines, some of them negative: up
+# to 1.5e-3 at a tolerance of 0.3, and less in proportion to the tolerance.
+MAX_EXCESS = 2e-3
 
 
 class WaveformModel(eqx.Module):
@@ -430,6 +435,33 @@ class BudgetTerms(NamedTuple):
     energy_budget: dict[str, Float[Array, "wavelengths"]]
     neglected: Float[Array, "wavelengths"]
     lost: Float[Array, "wavelengths"]
+
+
+def budget_excess(
+    energy_budget: Mapping[str, Float[Array, "wavelengths"]],
+    stderr: Mapping[str, Float[Array, "wavelengths"]],
+) -> Float[Array, ""]:
+    """Return by how much the fractions of an energy budget sum to more than 1 and five standard errors.
+
+    It is the largest of all wavelengths. The error of a sum is at most the sum of the errors.
+    """
+    total = sum(energy_budget.values())
+    return jnp.max(jnp.asarray(total - 1.0 - 5.0 * sum(stderr.values())))
+
+
+def refuse_excess(excess: Float[Any, "*shots"]) -> None:
+    """Refuse results whose energy budget has more light than was emitted.
+
+    **Arguments:** `excess`: see `budget_excess`; of several shots.
+
+    **Raises:** RuntimeError with the largest excess.
+    """
+    largest = float(np.max(excess, initial=0.0))
+    if largest > MAX_EXCESS:
+        raise RuntimeError(
+            f"the energy budget sums to {100.0 * largest:.3g} % more than the emitted light, beyond five "
+            "standard errors: light was counted twice, as where surfaces of your own coincide"
+        )
 
 
 class ResponseSums(NamedTuple):

@@ -17,7 +17,7 @@ from jaxlidar.io.checkpoint import Checkpoint
 from jaxlidar.io.netcdf import by_rows
 from jaxlidar.io.rows import unwritten_rows
 from jaxlidar.simulate import LateLightWarning, UnfollowedLightWarning
-from jaxlidar.spectral.apply_optics import make_waveform_model
+from jaxlidar.spectral.apply_optics import make_waveform_model, refuse_excess
 from jaxlidar.survey.acquisition import Acquisition
 from jaxlidar.survey.results import ShotResults
 from jaxlidar.survey.strategy import AbstractStrategy
@@ -72,6 +72,7 @@ def waveforms_in_memory(
     # Blocks come in the order of shots.
     blocks = [results for _, results in strategy.shot_results(task_results)]
     results: ShotResults = jax.tree.map(lambda *a: np.concatenate(a), *blocks)
+    refuse_excess(results.excess)
     _warn_of_missing_light(strategy, _MissingLight.of(results))
     return _waveforms(strategy, {**survey_fields, **results.waveform_fields()}, start_time, **info)
 
@@ -97,6 +98,7 @@ def waveforms_on_disk(
     with by_rows(layout, path, case) as rows:
         # One block of results is in memory at a time, whatever the number of shots.
         for shots, results in itertools.chain([(first_shots, first_results)], blocks):
+            refuse_excess(results.excess)
             fields = {name: _rows(value, shots) for name, value in survey_fields.items()}
             rows.add(shots, {**fields, **results.waveform_fields()})
             missing = missing.or_more(_MissingLight.of(results))

@@ -12,6 +12,7 @@ from jaxlidar._vectors import FAR, vec
 from jaxlidar.instrument.lidar import AIM_DISTANCE
 from jaxlidar.instrument.survey import Survey
 from jaxlidar.planning.size_buckets import size_bucket
+from jaxlidar.scenes.canopy import Canopy
 from jaxlidar.scenes.scene import Scene
 from jaxlidar.scenes.shapes import AbstractShape, Plane
 
@@ -24,10 +25,11 @@ _AXES_PER_BLOCK = 8192
 
 
 class OffMapWarning(UserWarning):
-    """Warning that a hundredth of a footprint's light or more falls outside the voxel map.
+    """Warning that a hundredth of a footprint's light or more falls outside the voxel map of a stand.
 
     Beyond a map with open sides the scene is empty, so that such a shot sees less canopy than there may be.
-    `Waveforms.off_map` has the fraction of every shot.
+    `Waveforms.off_map` has the fraction of every shot. There is no warning where nothing stands in the
+    outermost columns of the map, as around a tree on a lawn.
 
     **Example:** half a footprint outside the map.
 
@@ -193,6 +195,16 @@ def off_map(survey: Survey, scene: Scene) -> Float[np.ndarray, " shots"]:
             outside |= np.any((position < low[:2]) | (position > high[:2]), axis=-1)
         fractions[numbers] = outside.mean(axis=1)
     return fractions
+
+
+def is_cut_off(canopy: Canopy) -> bool:
+    """Return True if plants stand in the outermost columns of a voxel map: there may be more beyond."""
+    for density in (canopy.voxels.leaf, canopy.voxels.bark):
+        if density is not None:
+            values = np.asarray(density)
+            if values[[0, -1]].any() or values[:, [0, -1]].any():
+                return True
+    return False
 
 
 def off_map_message(fractions: Float[np.ndarray, " shots"]) -> str | None:

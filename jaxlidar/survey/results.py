@@ -7,7 +7,7 @@ from jaxtyping import Array, Float, Int
 
 from jaxlidar._not_kept import NotKept
 from jaxlidar.instrument.receiver import digitise
-from jaxlidar.spectral.apply_optics import BudgetTerms, WaveformModel
+from jaxlidar.spectral.apply_optics import BudgetTerms, WaveformModel, budget_excess
 from jaxlidar.spectral.waveform import energy_at_reference
 
 # Arrays of JAX within compiled programs, of one shot or of several; of NumPy outside.
@@ -32,6 +32,7 @@ class ShotResults(NamedTuple):
 
     - `late`: of the emitted light, the fraction after the end of the record. - `unfollowed`: of the waveform,
       the fraction that orders beyond the last may add. Both are the largest of all wavelengths.
+    - `excess`: of the sum of the energy budget (`jaxlidar.spectral.apply_optics.budget_excess`).
     - `OPTIONAL_ARRAYS`: None where they are not kept. - `truth`: a `Truths`, or None.
     """
 
@@ -41,6 +42,7 @@ class ShotResults(NamedTuple):
     photons: Int[Any, "*shots"]
     late: Float[Any, "*shots"]
     unfollowed: Float[Any, "*shots"]
+    excess: Float[Any, "*shots"]
     reflectance: _PerSample = None
     stderr: _PerSample = None
     energy: _PerSample = None
@@ -54,7 +56,7 @@ class ShotResults(NamedTuple):
     def waveform_fields(self) -> dict[str, Any]:
         """Return the fields that `Waveforms` has, too; arrays that are not kept are `NotKept`."""
         fields = self._asdict()
-        for name in ("late", "unfollowed"):
+        for name in ("late", "unfollowed", "excess"):
             del fields[name]
         return fields | {name: NotKept(name) for name in OPTIONAL_ARRAYS if fields[name] is None}
 
@@ -101,5 +103,6 @@ def make_shot_results(
         photons=photons,
         late=jnp.max(budget.energy_budget["after the window"]),
         unfollowed=jnp.max(budget.neglected / total),
+        excess=budget_excess(budget.energy_budget, errors.energy_budget),
         **{name: optional_arrays[name] for name in kept_names},
     )

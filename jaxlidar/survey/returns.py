@@ -36,6 +36,7 @@ Source: Wagner et al. (2004), Int. Arch. Photogramm. Remote Sens. 35, part B3, 2
 
 import dataclasses
 import os
+import time
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any, NamedTuple, TypeAlias, final
 
@@ -54,13 +55,13 @@ from jaxlidar._checks import (
 )
 from jaxlidar._constants import SPEED_OF_LIGHT
 from jaxlidar._not_kept import NotKept
+from jaxlidar._progress import TaskProgress
 from jaxlidar._registry import decompose_records
 from jaxlidar.instrument.lidar import Lidar
 from jaxlidar.instrument.survey import Survey, beam_directions
 from jaxlidar.io.airborne import AirborneShot, Returns, Segment
 from jaxlidar.io.las import write_las
 from jaxlidar.survey.acquisition import PULSE_OVERSAMPLING, Acquisition, acquisition_of
-from jaxlidar.survey.progress import ProgressClock, SurveyProgress
 
 DETECTORS = ("peak", "constant fraction", "leading edge", "decomposition")
 # A function of the times, samples and noise of one record, (samples,) each, which gives times of returns.
@@ -789,7 +790,7 @@ def returns_of(
     threshold: Any = None,
     fraction: Any = 0.5,
     max_returns: int | None = None,
-    progress: Callable[[SurveyProgress], None] | None = None,
+    progress: Callable[[TaskProgress], None] | None = None,
 ) -> DiscreteReturns:
     """Detect the returns of waveforms. Arguments are those of `Waveforms.returns`."""
     if not callable(detector):
@@ -807,7 +808,7 @@ def returns_of(
     if records.shape != shape:
         raise ValueError(f"record has shape {records.shape} at one wavelength; admissible is {shape}")
     settings = _Settings(detector, float(fraction), *_limits(shape, background, noise, threshold))
-    clock, blocks = ProgressClock(len(waves), 0), []
+    start_time, blocks = time.perf_counter(), []
     if is_own_record and settings.background is None:
         settings = settings._replace(background=np.full(shape[0], _recorded_background(waves)))
     for shots in waves.chunks:
@@ -816,9 +817,8 @@ def returns_of(
                 blocks.append(block)
         else:
             blocks.append(_detect_chunk(waves, records[shots], shots, settings, is_own_record))
-        clock.done = shots.stop
         if progress is not None:
-            progress(SurveyProgress(clock.done, len(waves), clock.seconds, clock.rate, clock.seconds_left))
+            progress(TaskProgress(shots.stop, len(waves), time.perf_counter() - start_time))
     echoes = {name: np.concatenate([block[name] for block in blocks]) for name in blocks[0]}
     return _assemble(waves, echoes, max_returns)
 

@@ -30,6 +30,7 @@ from jaxlidar._checks import (
     warn_user,
 )
 from jaxlidar._fingerprint import fingerprint
+from jaxlidar._progress import TaskProgress
 from jaxlidar._registry import simulate_survey
 from jaxlidar._workers import WorkUnit, outcomes
 from jaxlidar.instrument.survey import Survey
@@ -40,8 +41,7 @@ from jaxlidar.scenes.scene_parts import SceneParts
 from jaxlidar.survey.acquisition import acquisition_of
 from jaxlidar.survey.choose_strategy import choose_strategy
 from jaxlidar.survey.collect import StoredResults, waveforms_in_memory, waveforms_on_disk
-from jaxlidar.survey.coverage import OffMapWarning, ground_heights, off_map, off_map_message
-from jaxlidar.survey.progress import ProgressClock, SurveyProgress
+from jaxlidar.survey.coverage import OffMapWarning, ground_heights, is_cut_off, off_map, off_map_message
 from jaxlidar.survey.results import OPTIONAL_ARRAYS
 from jaxlidar.survey.strategy import AbstractStrategy
 from jaxlidar.survey.tiled_scene import TiledSceneStrategy
@@ -60,7 +60,7 @@ def simulate_many(
     path: str | os.PathLike[str] | None = None,
     executor: Executor | None = None,
     mesh: jax.sharding.Mesh | None = None,
-    progress: Callable[[SurveyProgress], None] | None = None,
+    progress: Callable[[TaskProgress], None] | None = None,
     shared: bool | None = None,
     truth: bool = False,
     keep: Collection[str] | None = None,
@@ -109,7 +109,7 @@ def simulate_many(
       worker dies gets a second try. Default None: this process, on all cores.
     - `mesh`: a `jax.sharding.Mesh`, whose devices do tasks: each takes the next one. A program is compiled
       for each device. Default None: the default device.
-    - `progress`: a function called with a `SurveyProgress` after every task; for instance `print`. Default
+    - `progress`: a function called with a `TaskProgress` after every task; for instance `print`. Default
       None.
     - `shared`: True traces with shared illumination, and refuses shots that cannot share light; False traces
       per shot. Default None: shared where it is possible and saves time.
@@ -122,9 +122,9 @@ def simulate_many(
 
     **Returns:** a `Waveforms`.
 
-    **Warns:** `OffMapWarning` where footprints lie partly outside the voxel map, `LateLightWarning` where
-    much light arrives after the end of the record, `UnfollowedLightWarning` where orders that are not
-    followed may add more than `rtol`.
+    **Warns:** `OffMapWarning` where footprints lie partly outside the voxel map of a stand,
+    `LateLightWarning` where much light arrives after the end of the record, `UnfollowedLightWarning` where
+    orders that are not followed may add more than `rtol`.
 
     **Raises:** TypeError for arguments of another class, and inside a JAX transformation. ValueError, before
     any work, for inadmissible arguments, a scene that reaches up to the sensor, shots that do not meet the
@@ -172,7 +172,9 @@ def simulate_many(
         setup = strategy.setup
         off_map_fractions = off_map(strategy.survey, setup.scene)
         heights = ground_heights(strategy.survey, setup.scene, setup.plan.limits.start_distance)
-    if (message := off_map_message(off_map_fractions)) is not None:
+    # Tiles are parts of a stand, whose sides are not looked at.
+    may_miss_plants = isinstance(scene, SceneParts) or (scene.canopy is not None and is_cut_off(scene.canopy))
+    if may_miss_plants and (message := off_map_message(off_map_fractions)) is not None:
         warn_user(message, OffMapWarning)
     survey_fields: dict[str, Any] = {
         "position": survey.position,
@@ -297,18 +299,18 @@ def _trace(
     strategy: AbstractStrategy,
     key: PRNGKeyArray,
     run_tasks: Callable[[list[WorkUnit]], Iterator[tuple[WorkUnit, Any]]],
-    progress: Callable[[SurveyProgress], None] | None,
+    progress: Callable[[TaskProgress], None] | None,
     task_results: MutableMapping[int, Any],
 ) -> Mapping[int, Any]:
     """Run the tasks without a result yet, and return the results of all tasks by number."""
     tasks, shots = strategy.tasks(key), len(strategy.survey)
     n_done = len(task_results)
     # Shots are counted in proportion to tasks: with shared illumination no task has shots of its own.
-    clock = ProgressClock(shots, shots * n_done // len(tasks))
+    start_time, stored = time.perf_counter(), shots * n_done // len(tasks)
     for unit, result in run_tasks([t for t in tasks if t.number not in task_results]):
         task_results[unit.number] = result
         n_done += 1
-        clock.done = shots * n_done // len(tasks)
         if progress is not None:
-            progress(SurveyProgress(clock.done, shots, clock.seconds, clock.rate, clock.seconds_left))
+            seconds = time.perf_counter() - start_time
+            progress(TaskProgress(shots * n_done // len(tasks), shots, seconds, stored=stored))
     return task_results

@@ -16,6 +16,7 @@ from jaxtyping import Float
 from scipy import spatial
 
 from jaxlidar._checks import concrete_number
+from jaxlidar.instrument.lidar import tan_half
 from jaxlidar.instrument.survey import Survey
 from jaxlidar.planning.size_buckets import size_bucket
 from jaxlidar.survey.footprint_splines import BeamSection, section_of
@@ -67,8 +68,7 @@ class ViewGeometry(NamedTuple):
         geometry = ViewGeometry(
             beam=section_of(survey),
             position=survey.position,
-            # From the full angle in mrad.
-            view_radius=None if field is None else 0.5e-3 * concrete_number(field) * slant,
+            view_radius=None if field is None else slant * float(tan_half(concrete_number(field), np)),
             max_shots=size_bucket(max(len(group.shots) for group in groups), 4),
             max_central=size_bucket(max(int(group.has_centre.sum()) for group in groups), 4),
             cell_shape=(0, 0, 0),

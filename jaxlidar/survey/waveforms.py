@@ -13,6 +13,7 @@ from jaxtyping import ArrayLike, Float, Int
 from jaxlidar._checks import check_numbers
 from jaxlidar._constants import SPEED_OF_LIGHT
 from jaxlidar._not_kept import NotKept
+from jaxlidar._progress import TaskProgress
 from jaxlidar._registry import detect_returns, true_returns
 from jaxlidar._summary import NOTABLE_FRACTION, percent
 from jaxlidar.instrument.lidar import Lidar
@@ -24,7 +25,6 @@ from jaxlidar.io.las_waveforms import write_las_waveforms
 from jaxlidar.sampling.adaptive import StopReason
 from jaxlidar.spectral.waveform import Waveform
 from jaxlidar.survey.acquisition import Acquisition
-from jaxlidar.survey.progress import SurveyProgress
 from jaxlidar.survey.results import OPTIONAL_ARRAYS
 from jaxlidar.survey.returns import (
     MAX_LAS_RETURNS,
@@ -228,7 +228,7 @@ class Waveforms(eqx.Module):
         threshold: ArrayLike | None = None,
         fraction: ArrayLike = 0.5,
         max_returns: int | None = None,
-        progress: Callable[[SurveyProgress], None] | None = None,
+        progress: Callable[[TaskProgress], None] | None = None,
     ) -> DiscreteReturns:
         """Detect the discrete returns of all shots, as a laser scanner reports them.
 
@@ -259,7 +259,7 @@ class Waveforms(eqx.Module):
         - `fraction`: level of "constant fraction" on the leading edge, over the amplitude, in (0, 1).
           Default 0.5.
         - `max_returns`: of a shot with more, the strongest so many are returned. Default None: all.
-        - `progress`: a function called with a `SurveyProgress` after every few thousand shots. Default None.
+        - `progress`: a function called with a `TaskProgress` after every few thousand shots. Default None.
 
         **Returns:** a `DiscreteReturns`.
 

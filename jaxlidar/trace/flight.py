@@ -106,7 +106,7 @@ def meet_surfaces(scene: DeviceScene, p: Photons, draws: tuple[Scalar, ...]) -> 
     """
     distances, outcomes, ratios, stops = [], [], [], []
     remaining_draws = iter(draws)
-    distances_ahead, mesh_normal = surface_distances(scene, p.x, p.w)
+    distances_ahead, mesh_normal = surface_distances(scene, p.x, p.w, p.surface)
     for i, (surface, distance) in enumerate(zip(scene.surfaces, distances_ahead)):
         if not surface.lights_itself:
             # Light that leaves this surface never meets it again; by rounding, the photon may start below it.

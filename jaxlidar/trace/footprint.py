@@ -190,13 +190,12 @@ class Beam(eqx.Module):
 def make_beam(lidar: Lidar) -> Beam:
     """Make the beam of a lidar."""
     slant = lidar.range_to_reference
-    view = None if lidar.field_of_view is None else slant * lidar.field_of_view * 0.5e-3
     return Beam(
         vec(lidar.direction),
         slant,
         lidar.footprint_radius,
         lidar.aperture_half_angle,
-        view,
+        lidar.view_radius,
         lidar.profile == "gaussian",
         from_sensor=lidar.has_sensor_position,
     )

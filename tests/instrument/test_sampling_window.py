@@ -48,3 +48,18 @@ def test_the_ground_peak_depends_on_the_scene_above_it():
         grounds[window] = [float(jnp.max(record(window, h).components["ground"])) for h in (2.0, 2.2)]
     assert grounds["fixed"][0] == pytest.approx(grounds["fixed"][1], rel=1e-4)
     assert abs(grounds["first return"][0] / grounds["first return"][1] - 1) > 0.02
+
+
+def test_a_window_that_opens_at_the_first_return_is_refused_within_a_transformation():
+    """The fine samples would be returned in place of those of the digitiser."""
+    lidar = jl.Lidar(receiver=jl.Receiver(window="first return"))
+    scene = jl.Scene(ground=jl.Ground())
+    plan = jl.plan(lidar, scene, max_orders=1)
+
+    def total(reflectance):
+        changed = jl.Scene(ground=jl.Ground(reflectance=reflectance))
+        return jl.simulate(lidar, changed, plan=plan, key=jax.random.key(0)).reflectance.sum()
+
+    assert float(total(0.3)) > 0.0
+    with pytest.raises(ValueError, match="first_return_window"):
+        jax.jit(total)(0.3)

@@ -163,3 +163,13 @@ def test_truth_that_a_plan_does_not_cover_is_nan():
 
     gaps = jax.jit(jax.vmap(gap))(jnp.array([0.0, 0.5]))
     assert np.isnan(gaps).all(axis=tuple(range(1, gaps.ndim))).tolist() == [False, True]
+
+
+def test_coverage_within_a_derivative_by_a_python_number():
+    plan = jl.plan(LIDAR, BARE, describe=False)
+
+    def covered_reflectance(reflectance):
+        scene = eqx.tree_at(lambda s: s.ground.reflectance, BARE, reflectance)
+        return jnp.where(is_covered(plan, LIDAR, scene), reflectance, 0.0)
+
+    assert jax.grad(covered_reflectance)(0.3) == 1.0

@@ -241,3 +241,26 @@ def test_short_pulses_take_more_rays(pulse, jitter, rays):
     assert jl.plan(lidar, scene, n_rays=64).n_rays == 64
     assert jl.plan(lidar, scene, max_orders=1).n_rays == 4096
     assert jl.plan(lidar, scene, footprint="fixed").n_rays == 4096
+
+
+@pytest.mark.parametrize("kind", ["canopy", "meshes[0]"])
+def test_a_scene_far_from_every_beam_is_of_another_map(kind):
+    """Map coordinates beside a lidar at the origin: nothing would be met, without a word."""
+    place = np.array([512345.0, 6123456.0, 0.0])
+    voxels = jl.VoxelMap.from_extinction(leaf=np.full((3, 3, 4), 0.4), voxel_size=1.0, origin=place)
+    triangle = np.array([[0.0, 0.0, 5.0], [5.0, 0.0, 5.0], [5.0, 5.0, 5.0]])
+    scene = {
+        "canopy": jl.Scene(canopy=jl.Canopy(voxels, leaf=jl.LeafOptics(0.4, 0.4)), ground=jl.Ground()),
+        "meshes[0]": jl.Scene(meshes=(jl.MeshSurface((triangle + place, [[0, 1, 2]])),), ground=jl.Ground()),
+    }[kind]
+    message = re.escape(kind) + " is 6145 km away from every beam; admissible is up to 100 km"
+    with pytest.raises(ValueError, match=message):
+        jl.plan(jl.Lidar(), scene)
+    with pytest.raises(ValueError, match=message):
+        jl.simulate_many(
+            jl.Survey(jl.Lidar(), position=[(0, 0), (5, 0)]), scene, key=jax.random.key(0), shared=False
+        )
+    # Beams that come near: straight down, from a satellite, and one of several.
+    jl.plan(jl.Lidar(position=place[:2] + 6e4), scene)
+    jl.plan(jl.Lidar(sensor=(*(place[:2] - (6e5, 0.0)), 6e5), zenith=45.0, azimuth=90.0), scene)
+    jl.plan(jl.Survey(jl.Lidar(), position=[(0, 0), place[:2]]), scene)

@@ -331,3 +331,34 @@ def test_case_files_name_files_of_meshes(tmp_path):
     (surface,) = jl.io.read_case(tmp_path / "case.toml").scene.meshes
     assert surface.materials == ("tile",)
     assert surface.bounds()[:, 1].tolist() == [[5.0, 5.0, 7.0], [25.0, 5.0, 6.0]]
+
+
+def panel(*more):
+    """Return a panel of 4 cm, and further triangles of 1 m at the given distances to the east."""
+    half = 0.02
+    corners = [[-half, -half, 5], [half, -half, 5], [half, half, 5], [-half, half, 5]]
+    faces = [[0, 1, 2], [0, 2, 3]]
+    for x in more:
+        faces.append([len(corners), len(corners) + 1, len(corners) + 2])
+        corners += [[x, 0, 0], [x + 1, 0, 0], [x, 1, 0]]
+    return np.array(corners, float), np.array(faces)
+
+
+def test_triangles_that_rounding_would_distort_are_refused():
+    if jnp.zeros(()).dtype == jnp.float64:
+        jl.MeshSurface(panel(2e5))
+        return
+    with pytest.raises(ValueError, match=r"2 triangles are rounded.*0.0566 m.*split the mesh"):
+        jl.MeshSurface(panel(2e5))
+    # The panel alone, anywhere; a mesh of the same size without small triangles; one that is not so wide.
+    corners, faces = panel()
+    jl.MeshSurface((corners + np.array([5e5, 6e6, 0.0]), faces))
+    jl.MeshSurface((np.array([[0.0, 0, 0], [2e5, 0, 0], [2e5, 2e5, 0]]), [[0, 1, 2]]))
+    jl.MeshSurface(panel(1e3))
+
+
+def test_the_largest_rounding_that_is_admitted_keeps_the_area():
+    corners, faces = panel(9e3)
+    placed = jl.MeshSurface((corners, faces)).corners()
+    area = 0.5 * np.linalg.norm(np.cross(*(placed[:, k] - placed[:, 0] for k in (1, 2))), axis=1)
+    assert np.sort(area)[:2].sum() == pytest.approx(0.04**2, rel=0.02)

@@ -592,6 +592,25 @@ def test_an_interrupt_says_where_finished_shots_are(tmp_path, monkeypatch):
     assert "a.nc.parts: the same call continues" in interrupt.value.__notes__[0]
 
 
+def test_a_tree_on_a_lawn_is_not_cut_off():
+    survey = jl.Survey(lidar(), [(2.0, 2.0), (20.0, 0.0)])
+    lad = np.zeros((4, 4, 2))
+    lad[1:3, 1:3] = 0.5
+    for row in ((0, 0), (3, 1), (1, 0), (2, 3)):
+        canopies = []
+        for density in (0.0, 0.5):
+            lad[row] = density
+            voxels = jl.VoxelMap.from_lad(lad, voxel_size=1.0)
+            canopies.append(jl.Canopy(voxels, leaf=jl.LeafOptics(0.4, 0.4)))
+        lad[row] = 0.0
+        assert [coverage.is_cut_off(canopy) for canopy in canopies] == [False, True]
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        scene = jl.Scene(canopy=canopies[0], ground=jl.Ground())
+        waveforms = jl.simulate_many(survey, scene, key=KEY, max_orders=1, rtol=0.2)
+    assert waveforms.off_map[1] == 1.0
+
+
 def test_light_off_the_map_is_that_of_a_circular_segment():
     # A disc of radius r whose middle lies h r inside of a straight rim: acos(h) - h sqrt(1 - h^2) over pi.
     voxels = jl.VoxelMap.from_lad(np.ones((40, 40, 1)), voxel_size=1.0)

@@ -4,12 +4,14 @@ Order one of a slab of extinction k of leaves of the reflectance R, seen along a
 (2/3) R (1 - exp(-k s)) with the hot spot, whichever way the beam goes. A wall is a plate on edge.
 """
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import jaxlidar as jl
+from jaxlidar.instrument.lidar import tan_half
 from tests.helpers import agrees, slab, slow_unless
 from tests.scenes.test_outlines import SPHERE, Sphere
 
@@ -113,6 +115,33 @@ def test_a_wide_beam_widens_from_the_sensor():
     assert mean_range(wave) == pytest.approx(mean, rel=1e-5)
     # Of a beam that does not widen the mean is 2 m.
     assert abs(mean - 2.0) > 100 * 1e-5
+
+
+def test_a_wide_field_of_view_is_an_angle():
+    """A top-hat beam of 7.5 m radius on level ground 10 m below, seen within 1 rad.
+
+    As above; the field ends, softly, where the tangent to the axis is tan(0.5), and not 0.5.
+    """
+    field = 1000.0
+    lidar = look((0.0, 0.0, 10.0), 0.0, field_of_view=field, profile="top-hat", sampling_interval=2.0)
+    # Wider than is admissible for a user, so that the field of view is what counts.
+    lidar = eqx.tree_at(lambda v: v.divergence, lidar, jnp.asarray(1500.0))
+    tangent = 0.75 * np.sqrt((np.arange(20_000) + 0.5) / 20_000)
+    expected = {}
+    for name, edge in (("angle", np.tan(0.5e-3 * field)), ("small angle", 0.5e-3 * field)):
+        seen = 1.0 / (1.0 + np.exp(np.clip((tangent / edge - 1.0) / 0.02, -80.0, 80.0)))
+        expected[name] = 0.3 * np.mean(seen / (1.0 + tangent**2))
+    wave = jl.simulate(lidar, jl.Scene(ground=jl.Ground()), key=KEY, max_orders=1, rtol=0.001)
+    assert total(wave) == pytest.approx(expected["angle"], rel=2e-3)
+    assert expected["angle"] == pytest.approx(0.1393, abs=2e-4)
+    assert expected["small angle"] == pytest.approx(0.1191, abs=2e-4)
+
+
+def test_the_half_space_and_what_is_wider():
+    assert float(tan_half(1000.0)) == pytest.approx(np.tan(0.5))
+    assert float(tan_half(3141.6)) == float(tan_half(3200.0)) > 900.0
+    with pytest.raises(ValueError, match=r"divergence.*300"):
+        jl.Lidar(divergence=301.0)
 
 
 @pytest.mark.slow
@@ -455,3 +484,11 @@ def test_a_lidar_with_a_sensor_is_kept_in_files(tmp_path):
     np.testing.assert_array_equal(
         jl.open(tmp_path / "waveforms.nc").ground_position, waveforms.ground_position
     )
+
+
+def test_messages_do_not_show_the_local_origin():
+    lidar, scene = look((512345.25, 6123456.5, 420.0), 0.0), jl.Scene(ground=jl.Ground(height=430.0))
+    with pytest.raises(ValueError, match="at the height 420 m is below the ground") as refusal:
+        jl.plan(lidar, scene)
+    assert "0.0, 0.0" not in str(refusal.value)
+    assert "512345.25, 6123456.5, 420" in str(lidar)

@@ -149,7 +149,7 @@ def test_fits_of_a_made_up_canopy(tmp_path):
     shots = [shot(1, random=random), *unusable_shots(), shot(4, random=random, degrade=1)]
     stages = []
     table = inversion.gedi_table(shots, fit=True, path=tmp_path / "fits", progress=stages.append)
-    assert [(p.done, p.total) for p in stages if p.stage == "fits"] == [(1, 2), (2, 2)]
+    assert [(p.done, p.total) for p in stages if p.unit == "fits"] == [(1, 2), (2, 2)]
     assert str(stages[0]).startswith("2 of 2 shots, ")
     assert str(stages[-1]).startswith("2 of 2 fits, ")
     with_fit = np.array([0, 3])
@@ -168,7 +168,7 @@ def test_fits_of_a_made_up_canopy(tmp_path):
     np.testing.assert_allclose(table["fit_pai"], area, rtol=1e-9)
     repeated_stages = []
     repeated = inversion.gedi_table(shots, fit=True, path=tmp_path / "fits", progress=repeated_stages.append)
-    assert all(p.stage == "shots" for p in repeated_stages)
+    assert all(p.unit == "shots" for p in repeated_stages)
     for name in names_of_fit():
         np.testing.assert_array_equal(repeated[name], table[name])
 

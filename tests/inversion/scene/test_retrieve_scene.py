@@ -47,8 +47,7 @@ def with_noise(waves, seed=0, fraction=0.02):
 def small_stand():
     """Retrieve a stand of 1000 voxels from 16 footprints."""
     survey = jl.Survey.grid(LIDAR, (2.0, 2.0), (8.0, 8.0), 2.0)
-    with pytest.warns(jl.OffMapWarning):
-        waves = jl.simulate_many(survey, stand(crowns()), key=jax.random.key(0), max_orders=1)
+    waves = jl.simulate_many(survey, stand(crowns()), key=jax.random.key(0), max_orders=1)
     observed, noise = with_noise(waves)
     prior = inversion.MarkovField(0.1)
     start = np.full((10, 10, 10), 0.05)
