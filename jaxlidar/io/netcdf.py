@@ -29,15 +29,8 @@ from jaxlidar.io.datasets import (
     result_of,
 )
 from jaxlidar.io.rows import BLOCK, CHECKSUMS, RowWriter
-from jaxlidar.io.stores import (
-    FORMAT,
-    NetcdfFile,
-    Store,
-    ZarrStore,
-    check_replaceable,
-    is_result_file,
-    is_zarr,
-)
+from jaxlidar.io.store import check_replaceable, is_zarr
+from jaxlidar.io.stores import FORMAT, NetcdfFile, Store, ZarrStore, is_result_file
 from jaxlidar.spectral.waveform import Waveform
 from jaxlidar.truth import Truth
 

@@ -23,10 +23,10 @@ import numpy as np
 from jaxlidar.io.checks import refuse_damage
 from jaxlidar.io.hdf5 import CheckedHeapStream
 from jaxlidar.io.rows import BLOCK, CHECKSUM, RowVariables, checksum_of
+from jaxlidar.io.store import is_zarr
 
 # The attribute of the root with the number of the format.
 FORMAT = "jaxlidar_format"
-_ZARR_SUFFIX = ".zarr"
 # The file that makes a folder a Zarr store of version 3.
 _ZARR_ROOT = "zarr.json"
 _HDF5_SIGNATURE = b"\x89HDF\r\n\x1a\n"
@@ -38,11 +38,6 @@ _FILTER_LOCK = threading.Lock()
 _RAW: dict[str, Any] = {"decode_cf": False, "create_default_indexes": False, "cache": False}
 
 
-def is_zarr(path: Path) -> bool:
-    """Return True if a path is that of a Zarr store, by its suffix."""
-    return path.suffix.lower() == _ZARR_SUFFIX
-
-
 def is_result_file(path: Path) -> bool:
     """Return True for the path of a Zarr store, and for an HDF5 file, by its first bytes."""
     if is_zarr(path):
@@ -51,12 +46,6 @@ def is_result_file(path: Path) -> bool:
         return False
     with path.open("rb") as file:
         return file.read(len(_HDF5_SIGNATURE)) == _HDF5_SIGNATURE
-
-
-def check_replaceable(path: Path) -> None:
-    """Refuse to replace a folder that is no Zarr store. **Raises:** ValueError."""
-    if is_zarr(path) and path.exists() and not (path / _ZARR_ROOT).is_file():
-        raise ValueError(f"{path}: it is there already and no Zarr store; nothing is overwritten")
 
 
 class NetcdfFile:
