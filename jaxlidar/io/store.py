@@ -18,9 +18,12 @@ which takes three times as long, and admits slices of rows alone.
 """
 
 import contextlib
+import json
 import os
 import shutil
-from collections.abc import Iterator, Mapping
+import threading
+import warnings
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -31,11 +34,15 @@ from jaxlidar.io.checks import DAMAGE_ERRORS
 
 _SUFFIX = ".zarr"
 # The file that makes a folder a Zarr store of version 3.
-_ROOT_FILE = "zarr.json"
+ROOT_FILE = "zarr.json"
 # The array that tells which rows are complete.
 DONE = "done"
+# The attribute with digests of the problem, as JSON.
+_PROBLEM = "problem"
 # Bytes of an array that are read together, to test their checksums.
 _BYTES_AT_ONCE = 2**26
+# Warning filters are one list for all threads: of two that change it, one would restore the other's.
+_FILTER_LOCK = threading.Lock()
 # Rows of a store: a slice, or their numbers.
 Rows = slice | np.ndarray
 
@@ -48,7 +55,7 @@ def is_zarr(path: Path) -> bool:
 def check_replaceable(path: Path) -> None:
     """Refuse to write a store in place of anything but a store. **Raises:** ValueError."""
     is_empty_folder = path.is_dir() and not any(path.iterdir())
-    if path.exists() and not is_empty_folder and not (path / _ROOT_FILE).is_file():
+    if is_zarr(path) and path.exists() and not is_empty_folder and not (path / ROOT_FILE).is_file():
         raise ValueError(f"{path}: it is there already and no Zarr store; nothing is overwritten")
 
 
@@ -63,11 +70,22 @@ def import_zarr() -> Any:
     return zarr
 
 
+def consolidate(path: Path) -> None:
+    """Write all metadata of a store in one place, without which xarray warns that opening takes long."""
+    import zarr
+
+    with _FILTER_LOCK, warnings.catch_warnings():
+        # zarr warns that the format does not specify it yet.
+        warnings.filterwarnings("ignore", "Consolidated metadata is currently not part", UserWarning)
+        zarr.consolidate_metadata(path, zarr_format=3)
+
+
 class ResultStore:
     """An open store; `open_store` makes it. `root` is its group of zarr."""
 
     def __init__(self, path: Path, root: Any):
         self.path, self.root = path, root
+        self._arrays_with_rows: set[str] = set()
 
     def rows(self, group: str, dimension: str, count: int, chunk: int = 1) -> "StoredRows":
         """Return the rows of a group, which is made unless it is there.
@@ -81,7 +99,22 @@ class ResultStore:
         """
         with _plain_errors(self.path):
             node = self.root.require_group(group) if group else self.root
-            return StoredRows(self.path, node, dimension, count, chunk)
+            rows = StoredRows(self.path, node, dimension, count, chunk)
+        self._arrays_with_rows |= {f"{group}/{name}".strip("/") for name in rows.names}
+        return rows
+
+    def damaged_arrays(self) -> list[str]:
+        """Return the names of damaged arrays among those without rows that `rows` has returned."""
+        damaged = []
+        for name, node in self.root.members(max_depth=None):
+            if hasattr(node, "nchunks") and name not in self._arrays_with_rows:
+                try:
+                    node[...]
+                    is_intact = node.nchunks == node.nchunks_initialized
+                except DAMAGE_ERRORS:
+                    is_intact = False
+                damaged += [] if is_intact else [name]
+        return sorted(damaged)
 
 
 class StoredRows:
@@ -103,6 +136,11 @@ class StoredRows:
         # A store that cannot be written is found before any work.
         self._arrays[DONE][:] = self.is_done
 
+    @property
+    def names(self) -> list[str]:
+        """Names of the arrays."""
+        return list(self._arrays)
+
     def create(
         self,
         name: str,
@@ -118,23 +156,22 @@ class StoredRows:
         """
         if name in self._arrays:
             return
-        from zarr.codecs import Crc32cCodec
-
-        shape, axis = list(like.shape), dimensions.index(self.dimension)
+        axis, shape = dimensions.index(self.dimension), list(like.shape)
         shape[axis] = self.count
-        # At least one: zarr admits no chunk without values, but arrays without any.
-        chunks = [max(size, 1) for size in shape]
-        chunks[axis] = max(self._chunk if chunk is None else chunk, 1)
-        self._arrays[name] = self._group.create_array(
-            name,
-            shape=tuple(shape),
-            chunks=tuple(chunks),
-            dtype=str if like.dtype.kind in "OUT" else like.dtype,
-            dimension_names=dimensions,
-            attributes=attributes,
-            compressors=[Crc32cCodec()],
-            config={"write_empty_chunks": True},
-        )
+        chunks = shape.copy()
+        chunks[axis] = self._chunk if chunk is None else chunk
+        self._arrays[name] = _create_array(self._group, name, like, shape, chunks, dimensions, attributes)
+
+    def write_dataset(self, rows: Rows, dataset: Any) -> None:
+        """Write the variables of an `xarray.Dataset` that have rows; those that the group lacks are made.
+
+        **Raises:** as `write`.
+        """
+        names = [str(n) for n, variable in dataset.variables.items() if self.dimension in variable.dims]
+        for name in names:
+            variable = dataset.variables[name]
+            self.create(name, variable.values, list(variable.dims), **attributes_of(dataset, name))
+        self.write(rows, {name: dataset.variables[name].values for name in names})
 
     def write(self, rows: Rows, values: Mapping[str, Any]) -> None:
         """Write the values of some rows by name, and that these rows are done.
@@ -148,9 +185,7 @@ class StoredRows:
                 array = np.asarray(value)
                 axes = [f"{name}_{axis}" for axis in range(1, array.ndim)]
                 self.create(name, array, [self.dimension, *axes])
-                # zarr takes texts of any length as objects.
-                array = array.astype(object) if array.dtype.kind in "UT" else array
-                self._arrays[name].oindex[self._index(name, rows)] = array
+                self._arrays[name].oindex[self._index(name, rows)] = _as_stored(array)
             self.is_done[rows] = True
             self._arrays[DONE][:] = self.is_done
         except OSError as error:
@@ -178,7 +213,7 @@ class StoredRows:
         Damaged chunks are removed, as zarr could not write a part of one. A warning names them.
         """
         is_done, is_intact, names = np.ones(self.count, bool), np.ones(self.count, bool), []
-        for name in sorted(self._arrays, key=lambda name: name != DONE):
+        for name in sorted(self._arrays, key=lambda name: (name != DONE, name)):
             size = self._arrays[name].chunks[self._axis(name)]
             for number, file in self._damaged_chunks(name, is_done):
                 file.unlink(missing_ok=True)
@@ -223,6 +258,62 @@ class StoredRows:
         return [(number, files[number]) for number in sorted(damaged)]
 
 
+def _create_array(
+    group: Any,
+    name: str,
+    like: np.ndarray,
+    shape: Sequence[int],
+    chunks: Sequence[int],
+    dimensions: Sequence[str],
+    attributes: Mapping[str, Any],
+) -> Any:
+    """Make an array of zarr of the type of `like`."""
+    from zarr.codecs import Crc32cCodec
+
+    return group.create_array(
+        name,
+        shape=tuple(shape),
+        # zarr admits arrays without values, but no such chunks.
+        chunks=tuple(max(size, 1) for size in chunks),
+        dtype=str if like.dtype.kind in "OUT" else like.dtype,
+        dimension_names=list(dimensions),
+        attributes=dict(attributes),
+        compressors=[Crc32cCodec()],
+        config={"write_empty_chunks": True},
+        overwrite=True,
+    )
+
+
+def _as_stored(array: np.ndarray) -> np.ndarray:
+    """Return texts of any length as objects, as zarr takes them."""
+    return array.astype(object) if array.dtype.kind in "UT" else array
+
+
+def put_dataset(group: Any, dataset: Any, rows: str | None = None) -> None:
+    """Write an `xarray.Dataset` to a group of zarr, but for variables with the dimension `rows`."""
+    for name, variable in dataset.variables.items():
+        if rows not in variable.dims:
+            values, attributes = variable.values, attributes_of(dataset, name)
+            shape = values.shape
+            _create_array(group, name, values, shape, shape, variable.dims, attributes)[...] = _as_stored(
+                values
+            )
+    group.attrs.update(dataset.attrs)
+
+
+def attributes_of(dataset: Any, name: str) -> dict[str, Any]:
+    """Return the attributes of a variable as xarray writes them, with the names of its coordinates.
+
+    CF conventions (section 5): a variable names the coordinates that are no dimensions.
+    """
+    variable = dataset.variables[name]
+    auxiliary = [c for c in dataset.coords if c not in dataset.dims]
+    named = [c for c in auxiliary if set(dataset.variables[c].dims) <= set(variable.dims)]
+    if not named or name in dataset.coords:
+        return dict(variable.attrs)
+    return {**variable.attrs, "coordinates": " ".join(named)}
+
+
 @contextlib.contextmanager
 def open_store(path: str | os.PathLike[str], problem: Mapping[str, str]) -> Iterator[ResultStore]:
     """Open a store, which nobody else can open until the block ends. A missing one is made.
@@ -247,11 +338,11 @@ def open_store(path: str | os.PathLike[str], problem: Mapping[str, str]) -> Iter
         with _plain_errors(path):
             path.mkdir(parents=True, exist_ok=True)
             stack.enter_context(FileLock(f"{path}.lock", timeout=0))
-            if not (path / _ROOT_FILE).is_file():
-                zarr.create_group(path, zarr_format=3, attributes={"problem": dict(problem)})
+            if not (path / ROOT_FILE).is_file():
+                zarr.create_group(path, zarr_format=3, attributes={_PROBLEM: json.dumps(dict(problem))})
             # Metadata that is consolidated is that of a finished run.
             root = zarr.open_group(path, mode="r+", zarr_format=3, use_consolidated=False)
-            stored = dict(root.attrs.get("problem", {}))
+            stored = json.loads(str(root.attrs.get(_PROBLEM, "{}")))
         check_same_problem(path, stored, problem)
         yield ResultStore(path, root)
 
