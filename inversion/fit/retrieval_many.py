@@ -58,7 +58,7 @@ from jaxlidar.extend import (
     task,
     warn_user,
 )
-from jaxlidar.io.store import ResultStore, open_store
+from jaxlidar.io.store import ResultStore, dataset_of_rows, open_store
 
 # Fits of a chunk of the store. Of each quantity a chunk is a file: fewer files, and small ones to rewrite.
 _FITS_PER_CHUNK = 16
@@ -347,7 +347,7 @@ class FinishedFits:
         try:
             for i in sorted(self._unwritten):
                 arrays = {name: [value] for name, value in self.summaries[i].to_arrays().items()}
-                self._rows.write(slice(i, i + 1), arrays)
+                self._rows.write(slice(i, i + 1), dataset_of_rows("footprint", arrays))
                 self._unwritten.remove(i)
         except OSError as error:
             if not self._has_warned:

@@ -72,7 +72,7 @@ from jaxlidar.extend import (
     check_range,
     fingerprint,
 )
-from jaxlidar.io.store import ResultStore, open_store
+from jaxlidar.io.store import ResultStore, dataset_of_rows, open_store
 
 # Rays of a footprint unless they are given: one for each column of voxels in it, within limits; photons.
 _RAYS, _PHOTONS = (32, 512), 2048
@@ -588,7 +588,8 @@ class _StoredSteps:
     def write(self, number: int, **arrays: Any) -> None:
         """Store a step, in place of an earlier one."""
         if self._rows is not None:
-            self._rows.write(slice(number, number + 1), {name: [array] for name, array in arrays.items()})
+            rows = {name: [array] for name, array in arrays.items()}
+            self._rows.write(slice(number, number + 1), dataset_of_rows(self._rows.dimension, rows))
 
 
 def _fit(

@@ -60,19 +60,24 @@ def write_groups(path: Path, datasets: Mapping[str, Any]) -> None:
             mode = "w" if group == "/" else "a"
             dataset.to_netcdf(path, mode=mode, group=group, engine="h5netcdf", encoding=encoding)
         return
+    for group, dataset in datasets.items():
+        write_zarr_group(path, group, dataset)
+    consolidate(path)
+
+
+def write_zarr_group(path: Path, group: str, dataset: Any) -> None:
+    """Write a dataset as a group of a Zarr store, in place of one that is there."""
     from zarr.codecs import Crc32cCodec
 
     # Texts of any length, also where there is none: zarr has no stable type for numpy's "U".
     texts = np.dtype("O", metadata={"vlen": str})
-    for group, dataset in datasets.items():
-        names = [name for name, variable in dataset.variables.items() if variable.dtype.kind == "U"]
-        written = dataset.assign_coords(
-            {name: (dataset[name].dims, dataset[name].values.astype(texts)) for name in names}
-        )
-        encoding = {n: {"compressors": [Crc32cCodec()]} for n in written.variables if n not in names}
-        options: dict[str, Any] = {"zarr_format": 3, "consolidated": False, "write_empty_chunks": True}
-        written.to_zarr(path, mode="a", group=group, encoding=encoding, **options)
-    consolidate(path)
+    names = [name for name, variable in dataset.variables.items() if variable.dtype.kind == "U"]
+    written = dataset.assign_coords(
+        {name: (dataset[name].dims, dataset[name].values.astype(texts)) for name in names}
+    )
+    encoding = {name: {"compressors": [Crc32cCodec()]} for name in written.variables if name not in names}
+    options: dict[str, Any] = {"zarr_format": 3, "consolidated": False, "write_empty_chunks": True}
+    written.to_zarr(path, mode="w", group=group, encoding=encoding, **options)
 
 
 # -- reading -----------------------------------------------------------------------------------------------

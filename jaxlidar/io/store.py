@@ -23,7 +23,7 @@ import os
 import shutil
 import threading
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -39,6 +39,8 @@ ROOT_FILE = "zarr.json"
 DONE = "done"
 # The attribute with digests of the problem, as JSON.
 _PROBLEM = "problem"
+# A chunk of zeros is written, too: a chunk that is not there is missing.
+_CONFIG = {"write_empty_chunks": True}
 # Bytes of an array that are read together, to test their checksums.
 _BYTES_AT_ONCE = 2**26
 # Warning filters are one list for all threads: of two that change it, one would restore the other's.
@@ -85,7 +87,7 @@ class ResultStore:
 
     def __init__(self, path: Path, root: Any):
         self.path, self.root = path, root
-        self._arrays_with_rows: set[str] = set()
+        self._rows: dict[str, StoredRows] = {}
 
     def rows(self, group: str, dimension: str, count: int, chunk: int = 1) -> "StoredRows":
         """Return the rows of a group, which is made unless it is there.
@@ -99,15 +101,15 @@ class ResultStore:
         """
         with _plain_errors(self.path):
             node = self.root.require_group(group) if group else self.root
-            rows = StoredRows(self.path, node, dimension, count, chunk)
-        self._arrays_with_rows |= {f"{group}/{name}".strip("/") for name in rows.names}
-        return rows
+            self._rows[group] = StoredRows(self.path, node, dimension, count, chunk)
+        return self._rows[group]
 
     def damaged_arrays(self) -> list[str]:
         """Return the names of damaged arrays among those without rows that `rows` has returned."""
+        with_rows = {f"{g}/{name}".strip("/") for g, rows in self._rows.items() for name in rows.arrays}
         damaged = []
         for name, node in self.root.members(max_depth=None):
-            if hasattr(node, "nchunks") and name not in self._arrays_with_rows:
+            if hasattr(node, "nchunks") and name not in with_rows:
                 try:
                     node[...]
                     is_intact = node.nchunks == node.nchunks_initialized
@@ -118,86 +120,85 @@ class ResultStore:
 
 
 class StoredRows:
-    """Arrays by name, whose rows are written in any order. `is_done`: (rows,) True for complete rows."""
+    """Arrays whose rows are written in any order.
+
+    - `arrays`: of zarr, by name. - `is_done`: (rows,) True for complete rows.
+    - `has_layout`: True if this run has written what all rows have in common.
+    """
 
     def __init__(self, path: Path, group: Any, dimension: str, count: int, chunk: int):
         self.path, self.dimension, self.count = path, dimension, count
         self._group, self._chunk = group, chunk
-        # A chunk of zeros is written, too, and a chunk that is not there is missing.
-        self._arrays = {
-            name: array.with_config({"write_empty_chunks": True})
+        self.arrays = {
+            name: array.with_config(_CONFIG)
             for name, array in group.arrays()
             if dimension in (array.metadata.dimension_names or ())
         }
-        if DONE not in self._arrays:
-            self.create(DONE, np.zeros(1, bool), [dimension], chunk=count)
-            self._arrays[DONE][:] = False
+        self.has_layout = False
+        if DONE not in self.arrays:
+            self._create_array(DONE, dataset_of_rows(dimension, {DONE: np.zeros(count, bool)}))[:] = False
         self.is_done = self._intact_rows()
         # A store that cannot be written is found before any work.
-        self._arrays[DONE][:] = self.is_done
+        self.arrays[DONE][:] = self.is_done
 
-    @property
-    def names(self) -> list[str]:
-        """Names of the arrays."""
-        return list(self._arrays)
+    def write(self, rows: Rows, dataset: Any) -> None:
+        """Write an `xarray.Dataset` of some rows, and that these rows are done.
 
-    def create(
-        self,
-        name: str,
-        like: np.ndarray,
-        dimensions: list[str],
-        *,
-        chunk: int | None = None,
-        **attributes: Any,
-    ) -> None:
-        """Make an array, unless it is there, for all rows; `like` has the values of some.
-
-        `chunk`: number of rows of a chunk. Default None: that of the group.
-        """
-        if name in self._arrays:
-            return
-        axis, shape = dimensions.index(self.dimension), list(like.shape)
-        shape[axis] = self.count
-        chunks = shape.copy()
-        chunks[axis] = self._chunk if chunk is None else chunk
-        self._arrays[name] = _create_array(self._group, name, like, shape, chunks, dimensions, attributes)
-
-    def write_dataset(self, rows: Rows, dataset: Any) -> None:
-        """Write the variables of an `xarray.Dataset` that have rows; those that the group lacks are made.
-
-        **Raises:** as `write`.
-        """
-        names = [str(n) for n, variable in dataset.variables.items() if self.dimension in variable.dims]
-        for name in names:
-            variable = dataset.variables[name]
-            self.create(name, variable.values, list(variable.dims), **attributes_of(dataset, name))
-        self.write(rows, {name: dataset.variables[name].values for name in names})
-
-    def write(self, rows: Rows, values: Mapping[str, Any]) -> None:
-        """Write the values of some rows by name, and that these rows are done.
-
-        Arrays that the group lacks are made: the dimension of rows is their first one.
+        Variables without rows, and attributes, are those of the first call.
 
         **Raises:** OSError where they cannot be written, as on a full disk: these rows are not done.
         """
         try:
-            for name, value in values.items():
-                array = np.asarray(value)
-                axes = [f"{name}_{axis}" for axis in range(1, array.ndim)]
-                self.create(name, array, [self.dimension, *axes])
-                self._arrays[name].oindex[self._index(name, rows)] = _as_stored(array)
+            if not self.has_layout:
+                self._write_layout(dataset)
+            for name, array in self.arrays.items():
+                if name != DONE:
+                    array.oindex[self._index(name, rows)] = _values(dataset.variables[name])
             self.is_done[rows] = True
-            self._arrays[DONE][:] = self.is_done
+            self.arrays[DONE][:] = self.is_done
         except OSError as error:
             self.is_done[rows] = False
             raise OSError(f"path = {self.path} could not be written ({error})") from error
 
+    def _write_layout(self, dataset: Any) -> None:
+        """Make the arrays with rows that are missing; write attributes and the variables without rows."""
+        for name, variable in dataset.variables.items():
+            if self.dimension not in variable.dims:
+                self._create_array(name, dataset)[...] = _values(variable)
+            elif name not in self.arrays:
+                self._create_array(name, dataset)
+        self._group.attrs.update(dataset.attrs)
+        self.has_layout = True
+
+    def _create_array(self, name: str, dataset: Any) -> Any:
+        """Make the array of a variable, in one chunk, or with chunks of rows."""
+        from zarr.codecs import Crc32cCodec
+
+        variable = dataset.variables[name]
+        sizes = chunks = dict(variable.sizes)
+        if self.dimension in sizes:
+            sizes = sizes | {self.dimension: self.count}
+            chunks = chunks | {self.dimension: self.count if name == DONE else self._chunk}
+        array = self._group.create_array(
+            name,
+            shape=tuple(sizes.values()),
+            # zarr admits arrays without values, but no such chunks.
+            chunks=tuple(max(size, 1) for size in chunks.values()),
+            dtype=str if variable.dtype.kind in "OUT" else variable.dtype,
+            dimension_names=list(sizes),
+            attributes=_attributes(dataset, name),
+            compressors=[Crc32cCodec()],
+            config=_CONFIG,
+            overwrite=True,
+        )
+        if self.dimension in sizes:
+            self.arrays[name] = array
+        return array
+
     def read(self, rows: Rows) -> dict[str, np.ndarray]:
         """Return the values of some rows by name."""
         return {
-            name: array.oindex[self._index(name, rows)]
-            for name, array in self._arrays.items()
-            if name != DONE
+            name: array.oindex[self._index(name, rows)] for name, array in self.arrays.items() if name != DONE
         }
 
     def _index(self, name: str, rows: Rows) -> tuple[Rows, ...]:
@@ -205,7 +206,7 @@ class StoredRows:
 
     def _axis(self, name: str) -> int:
         """Return the axis of rows of an array."""
-        return self._arrays[name].metadata.dimension_names.index(self.dimension)
+        return self.arrays[name].metadata.dimension_names.index(self.dimension)
 
     def _intact_rows(self) -> np.ndarray:
         """Return which rows are done, without those in damaged or missing chunks.
@@ -213,14 +214,14 @@ class StoredRows:
         Damaged chunks are removed, as zarr could not write a part of one. A warning names them.
         """
         is_done, is_intact, names = np.ones(self.count, bool), np.ones(self.count, bool), []
-        for name in sorted(self._arrays, key=lambda name: (name != DONE, name)):
-            size = self._arrays[name].chunks[self._axis(name)]
+        for name in sorted(self.arrays, key=lambda name: (name != DONE, name)):
+            size = self.arrays[name].chunks[self._axis(name)]
             for number, file in self._damaged_chunks(name, is_done):
                 file.unlink(missing_ok=True)
                 is_intact[number * size : (number + 1) * size] = False
                 names.append(f"chunk {number} of {Path(self._group.path) / name}")
             if name == DONE:
-                is_done = self._arrays[DONE][:]
+                is_done = self.arrays[DONE][:]
         if names:
             warn_user(
                 f"path = {self.path} is damaged, and these chunks are computed again: {', '.join(names)}"
@@ -229,7 +230,7 @@ class StoredRows:
 
     def _damaged_chunks(self, name: str, is_done: np.ndarray) -> list[tuple[int, Path]]:
         """Return the numbers and files of chunks that are damaged, or missing although rows are done."""
-        array, axis = self._arrays[name], self._axis(name)
+        array, axis = self.arrays[name], self._axis(name)
         # Without values there are no chunks.
         if array.size == 0:
             return []
@@ -258,50 +259,24 @@ class StoredRows:
         return [(number, files[number]) for number in sorted(damaged)]
 
 
-def _create_array(
-    group: Any,
-    name: str,
-    like: np.ndarray,
-    shape: Sequence[int],
-    chunks: Sequence[int],
-    dimensions: Sequence[str],
-    attributes: Mapping[str, Any],
-) -> Any:
-    """Make an array of zarr of the type of `like`."""
-    from zarr.codecs import Crc32cCodec
+def _values(variable: Any) -> np.ndarray:
+    """Return the values of a variable, with texts of any length as objects, as zarr takes them."""
+    return variable.values.astype(object) if variable.dtype.kind in "UT" else variable.values
 
-    return group.create_array(
-        name,
-        shape=tuple(shape),
-        # zarr admits arrays without values, but no such chunks.
-        chunks=tuple(max(size, 1) for size in chunks),
-        dtype=str if like.dtype.kind in "OUT" else like.dtype,
-        dimension_names=list(dimensions),
-        attributes=dict(attributes),
-        compressors=[Crc32cCodec()],
-        config={"write_empty_chunks": True},
-        overwrite=True,
+
+def dataset_of_rows(dimension: str, arrays: Mapping[str, Any]) -> Any:
+    """Return arrays whose first dimension is that of rows as an `xarray.Dataset`."""
+    import xarray
+
+    return xarray.Dataset(
+        {
+            name: ([dimension, *(f"{name}_{axis}" for axis in range(1, np.ndim(array)))], np.asarray(array))
+            for name, array in arrays.items()
+        }
     )
 
 
-def _as_stored(array: np.ndarray) -> np.ndarray:
-    """Return texts of any length as objects, as zarr takes them."""
-    return array.astype(object) if array.dtype.kind in "UT" else array
-
-
-def put_dataset(group: Any, dataset: Any, rows: str | None = None) -> None:
-    """Write an `xarray.Dataset` to a group of zarr, but for variables with the dimension `rows`."""
-    for name, variable in dataset.variables.items():
-        if rows not in variable.dims:
-            values, attributes = variable.values, attributes_of(dataset, name)
-            shape = values.shape
-            _create_array(group, name, values, shape, shape, variable.dims, attributes)[...] = _as_stored(
-                values
-            )
-    group.attrs.update(dataset.attrs)
-
-
-def attributes_of(dataset: Any, name: str) -> dict[str, Any]:
+def _attributes(dataset: Any, name: str) -> dict[str, Any]:
     """Return the attributes of a variable as xarray writes them, with the names of its coordinates.
 
     CF conventions (section 5): a variable names the coordinates that are no dimensions.

@@ -17,8 +17,9 @@ from jaxlidar._checks import warn_user
 from jaxlidar._summary import NOTABLE_FRACTION, percent, unfollowed_message
 from jaxlidar.io.case import Case
 from jaxlidar.io.datasets import datasets_of
+from jaxlidar.io.groups import write_zarr_group
 from jaxlidar.io.netcdf import datasets_with_case
-from jaxlidar.io.store import ResultStore, consolidate, put_dataset
+from jaxlidar.io.store import ResultStore, consolidate, dataset_of_rows
 from jaxlidar.simulate import LateLightWarning, UnfollowedLightWarning
 from jaxlidar.spectral.apply_optics import make_waveform_model
 from jaxlidar.survey.acquisition import Acquisition
@@ -83,7 +84,7 @@ class StoredContributions:
         for field, value in contribution._asdict().items():
             items = value.items() if isinstance(value, dict) else [("", value)]
             arrays |= {f"{field}.{item}": array for item, array in items}
-        self._rows.write(self._slices[number], arrays)
+        self._rows.write(self._slices[number], dataset_of_rows("row", arrays))
 
     def __getitem__(self, number: int) -> GroupContribution:
         fields: dict[str, Any] = {}
@@ -171,8 +172,6 @@ class StoredSurvey:
         self._store, self._strategy, self._survey_fields, self._case = store, strategy, survey_fields, case
         count, chunk = len(strategy.survey), strategy.shot_slices[0].stop
         self._light = store.rows("", "shot", count, chunk)
-        # Groups whose variables without rows have been written.
-        self._laid_out: set[str] = set()
         light, truth = StoredShots(self._light.is_done, self._write_light), ShotsInMemory(count)
         self._has_truth = strategy.n_tasks > strategy.n_light_tasks
         if self._has_truth:
@@ -194,32 +193,24 @@ class StoredSurvey:
             for name, value in self._survey_fields.items()
         }
         waveforms = _waveforms(self._strategy, {**fields, **results.waveform_fields()}, {})
-        if "/" not in self._laid_out:
-            self._lay_out(datasets_with_case(waveforms, self._case))
+        if self._light.has_layout:
+            datasets = datasets_of(waveforms)
+        else:
+            datasets = datasets_with_case(waveforms, self._case)
+            for path in datasets.keys() - {"/"}:
+                write_zarr_group(self._store.path, path, datasets[path])
         missing_light = {
             name: ("shot", getattr(results, name), {"units": "1", "long_name": long_name})
             for name, long_name in _MISSING_LIGHT.items()
         }
-        dataset = datasets_of(waveforms)["/"].assign(missing_light)
-        self._light.write_dataset(shots, dataset)
-
-    def _lay_out(self, datasets: dict[str, Any]) -> None:
-        """Write all of some groups but the rows of shots."""
-        root = self._store.root
-        for path, dataset in datasets.items():
-            has_rows = path in ("/", "/truth")
-            # `finish` writes `info`. A truth, which is another task's, has a group and no attribute.
-            left_out = {"info", "truth"} if self._has_truth else {"info"}
-            dataset.attrs = {name: value for name, value in dataset.attrs.items() if name not in left_out}
-            group = root if path == "/" else root.require_group(path.strip("/"))
-            put_dataset(group, dataset, rows="shot" if has_rows else None)
-        self._laid_out |= datasets.keys()
+        dataset = datasets["/"].assign(missing_light)
+        # `finish` writes `info`. A truth, which is another task's, is a group and no attribute.
+        left_out = {"info", "truth"} if self._has_truth else {"info"}
+        dataset.attrs = {name: value for name, value in dataset.attrs.items() if name not in left_out}
+        self._light.write(shots, dataset)
 
     def _write_truth(self, shots: Shots, truths: Truths) -> None:
-        datasets = datasets_of(truths, "/truth")
-        if "/truth" not in self._laid_out:
-            self._lay_out(datasets)
-        self._truth.write_dataset(shots, datasets["/truth"])
+        self._truth.write(shots, datasets_of(truths, "/truth")["/truth"])
 
     def finish(self, start_time: float, **info: Any) -> None:
         """Write what is known when all tasks are done."""

@@ -12,7 +12,9 @@ import pytest
 
 pytest.importorskip("zarr")
 
-from jaxlidar.io.store import check_same_problem, open_store
+from jaxlidar.io.store import check_same_problem, dataset_of_rows, open_store
+
+xarray = pytest.importorskip("xarray")
 
 PROBLEM = {"observed": "a", "key": "b"}
 COUNT, CHUNK = 7, 2
@@ -35,7 +37,7 @@ def written(path, units=(), problem=PROBLEM):
     with open_store(path, problem) as store:
         rows = store.rows("fits", "fit", COUNT, CHUNK)
         for unit in units:
-            rows.write(np.array(unit), rows_of(unit))
+            rows.write(np.array(unit), dataset_of_rows("fit", rows_of(unit)))
         done = np.flatnonzero(rows.is_done)
         return done.tolist(), rows.read(done)
 
@@ -66,20 +68,33 @@ def test_rows_are_read_as_they_were_written(path):
 
 
 def test_any_program_opens_a_store(path):
-    xarray = pytest.importorskip("xarray")
     data = xarray.open_zarr(path, group="fits", consolidated=False, chunks=None)
     assert data["values"].dims == ("fit", "values_1")
     assert data["done"].values.tolist() == [True, True, False, True, False, False, True]
 
 
-def test_rows_may_lie_along_another_axis(tmp_path):
+def test_rows_may_lie_along_another_axis_and_variables_have_none(tmp_path):
+    values, shots = np.arange(30.0).reshape(3, 2, 5), np.array([4, 1])
+    dataset = xarray.Dataset(
+        {
+            "x": (("material", "shot", "time"), values, {"units": "J"}),
+            "material": ("material", ["a", "b", "λ"]),
+        },
+        attrs={"title": "light"},
+    )
     with open_store(tmp_path / "a.zarr", PROBLEM) as store:
         rows = store.rows("", "shot", COUNT, CHUNK)
-        rows.create("x", np.zeros((3, 1, 5)), ["material", "shot", "time"], units="J")
-        rows.write(np.array([4, 1]), {"x": np.arange(30.0).reshape(3, 2, 5)})
-        np.testing.assert_array_equal(rows.read(np.array([4, 1]))["x"], np.arange(30.0).reshape(3, 2, 5))
-        assert store.root["x"].shape == (3, COUNT, 5)
-        assert store.root["x"].attrs["units"] == "J"
+        rows.write(shots, dataset)
+        np.testing.assert_array_equal(rows.read(shots)["x"], values)
+        assert store.damaged_arrays() == []
+        flip_a_bit(tmp_path / "a.zarr" / "material" / "c" / "0")
+        assert store.damaged_arrays() == ["material"]
+    written = xarray.open_zarr(
+        tmp_path / "a.zarr", consolidated=False, chunks=None, drop_variables="material"
+    )
+    assert written.x.sizes == {"material": 3, "shot": COUNT, "time": 5}
+    assert written.x.attrs["units"] == "J"
+    assert written.attrs["title"] == "light"
 
 
 # -- damage ----------------------------------------------------------------------------------------------
@@ -216,7 +231,7 @@ def write_rows(path):
     with open_store(path, PROBLEM) as store:
         rows = store.rows("fits", "fit", 10**4, 16)
         for number in range(10**4):
-            rows.write(slice(number, number + 1), rows_of([number]))
+            rows.write(slice(number, number + 1), dataset_of_rows("fit", rows_of([number])))
             print(number, flush=True)
 
 
@@ -262,7 +277,7 @@ def test_a_full_disk_loses_nothing_that_was_written(path, monkeypatch, fails_at)
         with monkeypatch.context() as patch:
             patch.setattr(_local, "_atomic_write", put_on_a_full_disk)
             with pytest.raises(OSError, match=r"run\.zarr could not be written \(.*No space left"):
-                rows.write(slice(2, 3), rows_of([2]))
+                rows.write(slice(2, 3), dataset_of_rows("fit", rows_of([2])))
         assert np.flatnonzero(rows.is_done).tolist() == [0, 1, 3, 6]
     done, values = written(path)
     assert done == [0, 1, 3, 6]
@@ -276,5 +291,5 @@ def test_writing_a_row_takes_little_time(tmp_path):
     with open_store(tmp_path / "run.zarr", PROBLEM) as store:
         rows, start = store.rows("fits", "fit", 10**4, 16), time.perf_counter()
         for number in range(20):
-            rows.write(slice(number, number + 1), rows_of([number]))
+            rows.write(slice(number, number + 1), dataset_of_rows("fit", rows_of([number])))
         assert time.perf_counter() - start < 20 * 0.5
