@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from jaxlidar.io.checks import existing_file, refuse_damage
-from jaxlidar.io.store import DONE, ROOT_FILE, consolidate, import_zarr, is_zarr
+from jaxlidar.io.store import DONE, ROOT_FILE, consolidate, import_packages, is_zarr
 
 _HDF5_SIGNATURE = b"\x89HDF\r\n\x1a\n"
 # Arrays with rows up to this size are read at once, and are NumPy's.
@@ -30,21 +30,7 @@ def is_result_file(path: Path) -> bool:
         return file.read(len(_HDF5_SIGNATURE)) == _HDF5_SIGNATURE
 
 
-def _import_h5netcdf() -> None:
-    """Import what netCDF files need. **Raises:** ImportError."""
-    try:
-        import h5netcdf  # noqa: F401
-        import xarray  # noqa: F401
-    except ImportError as error:
-        raise ImportError("netCDF files need h5netcdf and xarray: pip install 'jaxlidar[io]'") from error
-
-
 # -- writing -----------------------------------------------------------------------------------------------
-
-
-def import_packages(path: Path) -> None:
-    """Import what files of the kind of `path` need. **Raises:** ImportError where it is not installed."""
-    import_zarr() if is_zarr(path) else _import_h5netcdf()
 
 
 def write_groups(path: Path, datasets: Mapping[str, Any]) -> None:

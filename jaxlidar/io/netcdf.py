@@ -26,8 +26,8 @@ from jaxlidar.io.datasets import (
     keep_as_netcdf,
     result_of,
 )
-from jaxlidar.io.groups import StoredGroups, import_packages, is_result_file, open_groups, write_groups
-from jaxlidar.io.store import check_replaceable
+from jaxlidar.io.groups import StoredGroups, is_result_file, open_groups, write_groups
+from jaxlidar.io.store import check_replaceable, import_packages
 from jaxlidar.spectral.waveform import Waveform
 from jaxlidar.truth import Truth
 

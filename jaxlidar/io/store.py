@@ -18,6 +18,7 @@ which takes three times as long, and admits slices of rows alone.
 """
 
 import contextlib
+import importlib
 import json
 import os
 import shutil
@@ -35,6 +36,9 @@ from jaxlidar.io.checks import DAMAGE_ERRORS
 _SUFFIX = ".zarr"
 # The file that makes a folder a Zarr store of version 3.
 ROOT_FILE = "zarr.json"
+# Packages that are imported where they are needed.
+_ZARR_PACKAGES = "Zarr stores", ("filelock", "xarray", "zarr")
+_NETCDF_PACKAGES = "netCDF files", ("h5netcdf", "xarray")
 # The array that tells which rows are complete.
 DONE = "done"
 # The attribute with digests of the problem, as JSON.
@@ -61,15 +65,14 @@ def check_replaceable(path: Path) -> None:
         raise ValueError(f"{path}: it is there already and no Zarr store; nothing is overwritten")
 
 
-def import_zarr() -> Any:
-    """Return the package zarr. **Raises:** ImportError where it, xarray or filelock is not installed."""
-    try:
-        import filelock  # noqa: F401
-        import xarray  # noqa: F401
-        import zarr
-    except ImportError as error:
-        raise ImportError("Zarr stores need zarr, xarray and filelock: pip install 'jaxlidar[io]'") from error
-    return zarr
+def import_packages(path: Path) -> None:
+    """Import what a Zarr store, or otherwise a netCDF file, needs. **Raises:** ImportError."""
+    kind, names = _ZARR_PACKAGES if is_zarr(path) else _NETCDF_PACKAGES
+    for name in names:
+        try:
+            importlib.import_module(name)
+        except ImportError as error:
+            raise ImportError(f"{kind} need {name}: pip install 'jaxlidar[io]'") from error
 
 
 def consolidate(path: Path) -> None:
@@ -304,11 +307,13 @@ def open_store(path: str | os.PathLike[str], problem: Mapping[str, str]) -> Iter
     problem. OSError for a store that is in use, or cannot be written: it is found here, before any work.
     ImportError where zarr, xarray or filelock is not installed.
     """
-    path, zarr = Path(path), import_zarr()
-    from filelock import FileLock
-
+    path = Path(path)
     check_store_path(path)
     check_replaceable(path)
+    import_packages(path)
+    import zarr
+    from filelock import FileLock
+
     with contextlib.ExitStack() as stack:
         with _plain_errors(path):
             path.mkdir(parents=True, exist_ok=True)

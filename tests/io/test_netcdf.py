@@ -1,9 +1,9 @@
 """Results as netCDF and Zarr: exact round trips, units, cases that can be run again, damage, old files."""
 
-import builtins
 import dataclasses
 import json
 import pickle
+import sys
 from importlib import metadata
 
 import equinox as eqx
@@ -238,17 +238,12 @@ def test_a_class_of_another_package_is_loaded_by_its_entry_point(tmp_path, monke
     assert jl.open(tmp_path / "a.nc").top.tolist() == [1.0, 2.0]
 
 
-def test_missing_h5netcdf_names_the_extra_to_install(wave, tmp_path, monkeypatch):
-    original_import = builtins.__import__
-
-    def import_without_h5netcdf(name, *args, **kwargs):
-        if name == "h5netcdf":
-            raise ImportError(name)
-        return original_import(name, *args, **kwargs)
-
-    monkeypatch.setattr(builtins, "__import__", import_without_h5netcdf)
-    with pytest.raises(ImportError, match=r"pip install 'jaxlidar\[io\]'"):
-        wave.save(tmp_path / "a.nc")
+@pytest.mark.parametrize(("package", "suffix"), [("h5netcdf", ".nc"), ("zarr", ".zarr")])
+def test_missing_packages_are_named_with_the_extra_to_install(wave, tmp_path, monkeypatch, package, suffix):
+    # Python raises an ImportError for such an entry.
+    monkeypatch.setitem(sys.modules, package, None)
+    with pytest.raises(ImportError, match=rf"need {package}: pip install 'jaxlidar\[io\]'"):
+        wave.save(tmp_path / f"a{suffix}")
     assert list(tmp_path.iterdir()) == []
 
 
