@@ -201,7 +201,7 @@ def fit(
     path: Path | None = None,
     progress: Callable | None = None,
 ) -> FittedBatch:
-    """Fit records to one kind of scene in one batch, with its checkpoint in `path`.
+    """Fit records to one kind of scene in one batch, whose fits are stored in `path`.
 
     `echoes`: elevations of the echoes of every record, m. `impulse`: the receiver's response.
     """
@@ -380,7 +380,7 @@ def fit_shots(
             continue
         kind_records, echoes, record_verdicts = zip(*batches[kind.name])
         name = kind.name.replace(" ", "_")
-        path = None if stem is None else stem.with_name(f"{stem.name}.{name}.sqlite")
+        path = None if stem is None else stem.with_name(f"{stem.name}.{name}.zarr")
         batch = fit(kind, kind_records, echoes, instrument, impulse, path, progress)
         for i, verdict in enumerate(inversion.judge_fits(batch.fits, about=["ground"])):
             verdict &= record_verdicts[i]

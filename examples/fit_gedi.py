@@ -183,7 +183,7 @@ def main(argv=None):
     options.out.mkdir(parents=True, exist_ok=True)
     picture = stem.with_name(f"{stem.name}.png")
     with progress_bar() as progress:
-        rows, pictures = fit_shots(shots, stem.with_name(f"{stem.name}.sqlite"), progress)
+        rows, pictures = fit_shots(shots, stem.with_name(f"{stem.name}.zarr"), progress)
     tables = write_tables(rows, stem, UNITS)
     agreement, pairs = None, {}
     if options.answers is not None and pictures:

@@ -21,8 +21,8 @@ from inversion.fit.unknowns import Unknown
 from inversion.metrics.gedi_table import gedi_table
 from jaxlidar.cli.constants import INTERRUPTED, SUCCESS
 from jaxlidar.cli.shared import ResultPath, save_figure
+from jaxlidar.io.store import remove_store, store_beside
 from jaxlidar.io.tables import TABLE_FORMATS
-from jaxlidar.survey.simulate_many import checkpoint_path
 
 # Seconds between lines of progress in a log file.
 _LOG_SECONDS = 5.0
@@ -181,7 +181,7 @@ def gedi(files: tuple[Path, ...], out: Path, group: int, fit: bool, quiet: bool)
     Example:
       jaxlidar gedi GEDI01_B_2019108080338_O01964_T05337_02_003_01.h5 -o shots.csv
     """
-    checkpoint = checkpoint_path(out) if fit else None
+    store = store_beside(out) if fit else None
     is_terminal = sys.stderr.isatty()
     last_time = time.perf_counter()
 
@@ -197,17 +197,17 @@ def gedi(files: tuple[Path, ...], out: Path, group: int, fit: bool, quiet: bool)
 
     show = None if quiet else report
     try:
-        table = gedi_table(list(files), group=group, fit=fit, path=checkpoint, progress=show)
+        table = gedi_table(list(files), group=group, fit=fit, path=store, progress=show)
     except KeyboardInterrupt:
-        if checkpoint is None:
+        if store is None:
             raise
-        message = f"finished fits are kept in {checkpoint}: the same command continues with them"
+        message = f"finished fits are kept in {store}: the same command continues with them"
         click.echo(f"jaxlidar: interrupted; {message}", err=True)
         return INTERRUPTED
     table.save(out)
     # All that it held is in the table.
-    if checkpoint is not None:
-        checkpoint.unlink(missing_ok=True)
+    if store is not None:
+        remove_store(store)
     qualities, counts = np.unique(table["quality"], return_counts=True)
     summary = ", ".join(f"{count} {quality}" for quality, count in zip(qualities, counts))
     click.echo(f"{len(table)} shots: {summary}; written: {out}")

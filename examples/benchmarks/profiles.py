@@ -181,8 +181,8 @@ def compare_methods(
             progress=lambda p: print(f"\r{slope:g} degrees, orders {orders}: {p}", end="", flush=True),
         )
 
-    fits = fit(slice(None), arguments.out / f"profiles_{slope:g}_{orders}_{number}.sqlite")
-    # Repeat some fits without the file, to time them when everything is compiled.
+    fits = fit(slice(None), arguments.out / f"profiles_{slope:g}_{orders}_{number}.zarr")
+    # Repeat some fits without the store, to time them when everything is compiled.
     repeated = slice(0, len(rows), number) if slope == SLOPES[1] else slice(0)
     seconds = 0.0
     if len(range(*repeated.indices(len(rows)))) and orders == 1:

@@ -139,7 +139,7 @@ def main() -> dict:
         starts=arguments.starts,
         start=start,
         lanes=8,
-        path=arguments.out / f"retrieval_coverage_{n}.sqlite",
+        path=arguments.out / f"retrieval_coverage_{n}.zarr",
         progress=lambda p: print(f"\r{p}", end="", flush=True),
         **common,
     )

@@ -4,7 +4,7 @@
 kind of number; from these,
 
 - `inversion.fit.result` makes a `Retrieval` from one summary and a `Retrievals` from many;
-- `to_arrays`, `from_arrays` and `check` write an entry of a checkpoint, and read and check it.
+- `to_arrays` and `from_arrays` write a row of a store, and read it.
 
 `FitDetails` holds what only the result of a single fit has.
 """
@@ -131,42 +131,6 @@ class FitSummary:
         # Scalars were stored as arrays without axes.
         quantities: dict[str, Any] = {name: a if a.ndim else a.item() for name, a in arrays.items()}
         return FitSummary(**quantities)
-
-    def check(self, sizes: SummarySizes) -> None:
-        """Check a summary that was read from a file.
-
-        **Raises:** ValueError for quantities of another kind or shape, and for numbers that no fit gives.
-        """
-        # A file with intact checksums may still hold entries that another program wrote.
-        for field in dataclasses.fields(self):
-            array, kind = np.asarray(getattr(self, field.name)), field.metadata["kind"]
-            shape = tuple(getattr(sizes, axis) for axis in field.metadata["axes"])
-            if (array.dtype.kind, array.shape) != (kind, shape):
-                raise ValueError(
-                    f"{field.name} is {array.dtype} of the shape {array.shape}; admissible is {kind!r} of "
-                    f"{shape}"
-                )
-        if self.steps < 1 or not np.all(np.isfinite(self.values)):
-            raise ValueError(
-                f"values = {self.values} after {self.steps} steps; admissible are finite values after one or "
-                "more"
-            )
-        if self.converged and not self._is_regular():
-            raise ValueError("it is said to have converged, but its numbers are not finite")
-
-    def _is_regular(self) -> bool:
-        """Return True for the numbers of a converged fit.
-
-        A fit that has not converged may have no finite waveform, and an undetermined unknown has an infinite
-        error.
-        """
-        return bool(
-            np.isfinite(self.reduced_chi2)
-            and np.all(np.isfinite(self.fitted))
-            and np.all(self.stderr >= 0)
-            and np.all(self.robust_stderr >= self.stderr)
-            and not np.any(np.isnan(self.covariance))
-        )
 
 
 @dataclasses.dataclass(frozen=True)

@@ -29,7 +29,7 @@ import optimistix as optx
 from jaxtyping import Array, ArrayLike, PRNGKeyArray
 
 from inversion.fit.data import ObservedWaveform, as_noise, as_observed, with_fixed_window
-from inversion.fit.fit_summary import FitSummary, SummarySizes
+from inversion.fit.fit_summary import FitSummary
 from inversion.fit.model import Evaluation, ForwardModel, SimulationInputs, evaluate_scene
 from inversion.fit.planning import checked_plan, trace_sizes
 from inversion.fit.recorder_model import RecorderModel, check_names, recorder_unknowns
@@ -44,7 +44,7 @@ from inversion.fit.solver import (
     key_of_starts,
     multistart,
 )
-from inversion.fit.unknowns import BoundUnknown, Unknown, bind_unknowns, smooth_names, with_start
+from inversion.fit.unknowns import BoundUnknown, Unknown, bind_unknowns, with_start
 from inversion.receiver.recorder import Recorder
 from jaxlidar import Lidar, Plan, Scene, TaskProgress
 from jaxlidar.extend import (
@@ -59,8 +59,10 @@ from jaxlidar.extend import (
     task,
     warn_user,
 )
-from jaxlidar.io.checkpoint import Checkpoint, open_checkpoint
+from jaxlidar.io.store import ResultStore, dataset_of_rows, open_store
 
+# Fits of a chunk of the store. Of each quantity a chunk is a file: fewer files, and small ones to rewrite.
+_FITS_PER_CHUNK = 16
 # Chunks of a worker are this many times its lockstep group: it is busy while slow fits end, and loses little
 # if it dies.
 _GROUPS_PER_CHUNK = 4
@@ -111,11 +113,12 @@ def retrieve_many(
     - `start`: by name, (footprints, ...) values that unknowns start from. Default None: their own.
     - `lanes`: number of footprints simulated together (batch size), at least 1; memory grows with it. Default
       16.
-    - `path`: a checkpoint, an SQLite file that stores every fit once it has ended, so that a run that was
-      interrupted or killed goes on where it stopped. It belongs to the problem: everything that the result
-      depends on must be as it was, and only `lanes`, `executor` and `progress` may change. One run at a time
-      can use it. Damaged entries are named in a warning and fitted again. If it cannot be written any more,
-      as on a full disk, a warning says so once and the fits go on. Default None: no file.
+    - `path`: a Zarr store, whose name ends in ".zarr", to which every fit is written once it has ended, so
+      that a run that was interrupted or killed goes on where it stopped. It belongs to the problem:
+      everything that the result depends on must be as it was, and only `lanes`, `executor` and `progress` may
+      change. One run at a time can use it. Damaged chunks are named in a warning and their fits are repeated.
+      If it cannot be written any more, as on a full disk, a warning says so once and the fits go on. Default
+      None: no store.
     - `executor`: a `concurrent.futures.Executor`, whose workers fit chunks of footprints, as for
       `jaxlidar.simulate_many`. Unknowns are sent to them: give paths, or functions of a module. A chunk whose
       worker dies gets a second try. Default None: this process.
@@ -124,7 +127,7 @@ def retrieve_many(
     **Returns:** a `Retrievals`, which does not depend on the number of workers.
 
     **Raises:** ValueError for inadmissible arguments, as `retrieve` does, and for a `path` that is
-    damaged, no checkpoint, or one of another problem, with what differs. TypeError for arguments of another
+    damaged, no Zarr store, or one of another problem, with what differs. TypeError for arguments of another
     kind. OSError for a `path` that cannot be written, before any fit, or that another run uses. RuntimeError
     if the workers of a chunk die twice.
 
@@ -145,7 +148,7 @@ def retrieve_many(
     y = as_numpy(observed, "observed")
     if y.ndim != 3 or len(y) == 0:
         raise ValueError(f"observed has the shape {y.shape}; admissible is (footprints, wavelengths, bins)")
-    n_footprints, n_wavelengths, n_bins = y.shape
+    n_footprints = len(y)
     sigma = as_noise(noise, y.shape)
     check_key(key)
     check_progress(progress)
@@ -216,15 +219,9 @@ def retrieve_many(
         settings=settings,
         groups=LockstepGroups.for_fits(min(lanes, n_footprints)),
     )
-    summary_sizes = SummarySizes(
-        unknowns=sum(u.start.size for u in all_unknowns),
-        smooth_priors=len(smooth_names(all_unknowns)),
-        wavelengths=n_wavelengths,
-        bins=n_bins,
-    )
-    no_checkpoint = contextlib.nullcontext()
-    with no_checkpoint if path is None else open_checkpoint(path, fingerprint(problem_parts)) as checkpoint:
-        finished = FinishedFits(checkpoint, n_footprints, summary_sizes)
+    no_store = contextlib.nullcontext()
+    with no_store if path is None else open_store(path, fingerprint(problem_parts)) as store:
+        finished = FinishedFits(store, n_footprints)
         start_time, n_stored = perf_counter(), len(finished.summaries)
         missing = [i for i in range(n_footprints) if i not in finished.summaries]
         fits = (
@@ -305,30 +302,33 @@ def _of_footprint(objects: Sequence[Any], i: int) -> Any:
 
 
 class FinishedFits:
-    """Records of the fits that have ended, by footprint, and their checkpoint, if there is one."""
+    """Records of the fits that have ended, by footprint, and their store, if there is one."""
 
-    def __init__(self, checkpoint: Checkpoint | None, n_footprints: int, sizes: SummarySizes):
-        self._checkpoint, self.n_footprints, self._sizes = checkpoint, n_footprints, sizes
+    def __init__(self, store: ResultStore | None, n_footprints: int):
+        self.n_footprints = n_footprints
+        self._rows = None if store is None else store.rows("", "footprint", n_footprints, _FITS_PER_CHUNK)
+        self._unwritten: set[int] = set()
         self._has_warned = False
         self.summaries: dict[int, FitSummary] = {}
-        if checkpoint is not None:
-            self.summaries |= checkpoint.intact_entries(self._decode)
-
-    def _decode(self, number: int, arrays: Mapping[str, np.ndarray]) -> FitSummary:
-        if not 0 <= number < self.n_footprints:
-            raise ValueError(f"its number is outside the admissible range [0, {self.n_footprints - 1}]")
-        summary = FitSummary.from_arrays(arrays)
-        summary.check(self._sizes)
-        return summary
+        if self._rows is not None:
+            numbers = np.flatnonzero(self._rows.is_done)
+            arrays = self._rows.read(numbers)
+            for row, number in enumerate(numbers.tolist()):
+                of_fit = {name: np.asarray(array[row]) for name, array in arrays.items()}
+                self.summaries[number] = FitSummary.from_arrays(of_fit)
 
     def add(self, number: int, summary: FitSummary) -> None:
         """Add a fit, and store it. A first failure to store warns; all fits are in memory anyway."""
-        # In memory first: results are returned whatever happens to the file.
+        # In memory first: results are returned whatever happens to the store.
         self.summaries[number] = summary
-        if self._checkpoint is None:
+        if self._rows is None:
             return
+        self._unwritten.add(number)
         try:
-            self._checkpoint.add(number, summary.to_arrays())
+            for i in sorted(self._unwritten):
+                arrays = {name: [value] for name, value in self.summaries[i].to_arrays().items()}
+                self._rows.write(slice(i, i + 1), dataset_of_rows("footprint", arrays))
+                self._unwritten.remove(i)
         except OSError as error:
             if not self._has_warned:
                 self._has_warned = True

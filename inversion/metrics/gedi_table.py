@@ -29,6 +29,7 @@ lengths, compiles each program once.
 import os
 import time
 from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -61,6 +62,7 @@ from jaxlidar.extend import (
 )
 from jaxlidar.io import Column, ColumnAxis, GediShot, ShotTable
 from jaxlidar.io.gedi import IncompleteShot, read_gedi_rows
+from jaxlidar.io.store import check_store_path
 
 # Setting groups of the product, and shots that are computed at once.
 _GROUPS, _BATCH = range(1, 7), 64
@@ -119,8 +121,8 @@ def gedi_table(
     - `projection`: of plant area, as for `plant_area_index`. Default 0.5.
     - `clumping`: index of clumping, as for `plant_area_index`. Default 1.
     - `fit`: also fit a layered canopy over sloping ground to each shot, see below. Default False.
-    - `path`: a checkpoint that stores every fit once it has ended, as for `inversion.retrieve_many`: the same
-      call continues with it. Default None: no file.
+    - `path`: a Zarr store of every fit that has ended, as for `inversion.retrieve_many`: the same call
+      continues with it. Default None: no store.
     - `progress`: called with a `TaskProgress` after each batch of shots, and after each fit. Default None.
 
     **Returns:** a `jaxlidar.io.ShotTable`, a row for each shot in their order, with
@@ -188,8 +190,11 @@ def gedi_table(
         raise ValueError(f"edges = {edges}; admissible are two heights or more, increasing")
     check_kind("fit", fit, bool | np.bool_, "True or False")
     check_kind("path", path, str | os.PathLike | None, "a path, or None")
-    if path is not None and not fit:
-        raise ValueError(f"path = {os.fspath(path)!r} is the checkpoint of fits: it needs fit=True")
+    if path is not None:
+        if not fit:
+            raise ValueError(f"path = {os.fspath(path)!r} is the store of fits: it needs fit=True")
+        # Before the closed forms, which take their time.
+        check_store_path(Path(path))
     start_time = time.perf_counter()
     rows = _rows_of(shots)
     refusals = [_refusal(row) for row in rows]

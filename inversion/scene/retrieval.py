@@ -72,7 +72,7 @@ from jaxlidar.extend import (
     check_range,
     fingerprint,
 )
-from jaxlidar.io.checkpoint import Checkpoint, open_checkpoint
+from jaxlidar.io.store import ResultStore, dataset_of_rows, open_store
 
 # Rays of a footprint unless they are given: one for each column of voxels in it, within limits; photons.
 _RAYS, _PHOTONS = (32, 512), 2048
@@ -86,8 +86,6 @@ _CG_STEPS, _CG_RTOL = 40, 0.03
 _BOUND_MARGIN = 1e-6
 # Standard deviations of a log-normal prior below its median at which a bound of zero is moved.
 _LOG_REACH = 8.0
-# Numbers of entries of a checkpoint: the fit, and draws and kernels from here on.
-_ENTRY_OF_FIT, _FIRST_DRAW, _FIRST_KERNEL = 0, 1, 1_000_000
 
 
 @dataclasses.dataclass(frozen=True)
@@ -187,15 +185,15 @@ def retrieve_scene(
     - `max_orders`: orders of scattering, at least 1. Default None: as many as the albedos ask for.
     - `n_rays`, `n_photons`: of each shot. Default None: a ray for each column of voxels in a footprint,
       within 32 and 512; 2048 photons.
-    - `path`: a checkpoint, an SQLite file. A run that was interrupted goes on from its last step. Only
-      `progress` may change. Default None: no file.
+    - `path`: a Zarr store, whose name ends in ".zarr". A run that was interrupted goes on from its last step,
+      draw or kernel. Only `progress` may change. Default None: no store.
     - `progress`: called with a `SceneStep` after every step. Default None.
 
     **Returns:** a `SceneRetrieval`.
 
-    **Raises:** ValueError for inadmissible arguments, as `retrieve` does, and for a `path` that is damaged or
-    one of another problem; TypeError for arguments of another kind; OSError for a `path` that cannot be
-    written.
+    **Raises:** ValueError for inadmissible arguments, as `retrieve` does, and for a `path` that is no Zarr
+    store or one of another problem; TypeError for arguments of another kind; OSError for a `path` that
+    cannot be written.
 
     **Example:** the height of the ground, the same under nine footprints.
 
@@ -222,7 +220,7 @@ def retrieve_scene(
     shot_groups = _shot_groups(gain, offset, groups, len(survey), bound)
     places = _kernel_places({} if kernels is None else kernels, bound)
     sizes = {"max_orders": max_orders, "n_rays": n_rays, "n_photons": n_photons}
-    # Everything that the result depends on: a checkpoint of another problem is refused.
+    # Everything that the result depends on: a store of another problem is refused.
     parts = {
         "waveforms": records.observed,
         "noise": records.sigma,
@@ -233,6 +231,7 @@ def retrieve_scene(
         "groups": shot_groups.group,
         "held_out": float(held_out),
         "max_steps": max_steps,
+        "draws": draws,
         "kernels": places,
         "key": key,
         "plan": plan,
@@ -251,12 +250,16 @@ def retrieve_scene(
     fitted_weight = np.where(is_held_out[:, None, None], 0.0, weight)
     model = SurveyModel(survey, scene, plan, bound, shot_groups, records.observed, fitted_weight, trace_key)
     problem = _Problem(model, MapPriors(model.all_unknowns), records.observed, weight, is_held_out)
-    no_checkpoint = contextlib.nullcontext()
-    with no_checkpoint if path is None else open_checkpoint(path, fingerprint(parts)) as checkpoint:
-        store = _Store(checkpoint)
-        end = _fit(problem, max_steps, random, store, progress)
-        errors = _draws_of_error(problem, end, draws, host_key, store, progress)
-        rows = _averaging_kernels(problem, end, places, store, progress)
+    n_kernels = sum(len(indices) for indices in places.values())
+    no_store = contextlib.nullcontext()
+    with no_store if path is None else open_store(path, fingerprint(parts)) as store:
+        steps, stored_draws, stored_kernels = (
+            _StoredSteps(store, *sizes_of_group)
+            for sizes_of_group in (("steps", max_steps), ("draws", draws), ("kernels", n_kernels))
+        )
+        end = _fit(problem, max_steps, random, steps, progress)
+        errors = _draws_of_error(problem, end, draws, host_key, stored_draws, progress)
+        rows = _averaging_kernels(problem, end, places, stored_kernels, progress)
     return make_scene_retrieval(
         unknowns=model.all_unknowns,
         values=end.x,
@@ -568,46 +571,63 @@ class _FitEnd(NamedTuple):
     status: str
 
 
-class _Store:
-    """A checkpoint, or none: arrays by number of entry."""
+class _StoredSteps:
+    """Steps of a run that are stored, or none: arrays by number of the step, draw or kernel."""
 
-    def __init__(self, checkpoint: Checkpoint | None):
-        self.checkpoint = checkpoint
-        self.entries = {} if checkpoint is None else dict(checkpoint.intact_entries(lambda _, arrays: arrays))
+    def __init__(self, store: ResultStore | None, group: str, count: int):
+        self._rows = None if store is None else store.rows(group, group.removesuffix("s"), count)
 
-    def add(self, number: int, **arrays: Any) -> None:
-        """Store an entry, in place of an earlier one."""
-        if self.checkpoint is not None:
-            self.checkpoint.add(number, arrays)
+    def read(self, number: int) -> dict[str, np.ndarray] | None:
+        """Return the arrays of a step; None where it is not stored."""
+        if self._rows is None or not self._rows.is_done[number]:
+            return None
+        return {
+            name: np.asarray(array[0]) for name, array in self._rows.read(slice(number, number + 1)).items()
+        }
+
+    def write(self, number: int, **arrays: Any) -> None:
+        """Store a step, in place of an earlier one."""
+        if self._rows is not None:
+            rows = {name: [array] for name, array in arrays.items()}
+            self._rows.write(slice(number, number + 1), dataset_of_rows(self._rows.dimension, rows))
 
 
 def _fit(
     problem: _Problem,
     max_steps: int,
     random: np.random.Generator,
-    store: _Store,
+    store: _StoredSteps,
     progress: Callable[[SceneStep], None] | None,
 ) -> _FitEnd:
     """Minimise the objective until the held-out misfit no longer falls.
 
-    1. Start from the unknowns' starts, or from the last step of a checkpoint.
-    2. After each step of L-BFGS-B note both misfits, and store the values, and the best values so far.
+    1. Start from the unknowns' starts, or from the last step that is stored.
+    2. After each step of L-BFGS-B note both misfits, and store them and the values.
     3. Stop when the criterion, the held-out misfit or without one the objective, has not fallen.
     """
     x = np.clip(flat_start(problem.model.all_unknowns), problem.low, problem.high)
     scale = problem.scale(x, random)
     history: list[tuple[float, float, float]] = []
-    best_x, stopped, at_minimum = x, False, False
-    if stored := store.entries.get(_ENTRY_OF_FIT):
-        x, best_x = stored["x"], stored["best_x"]
-        history = [tuple(row) for row in stored["history"]]
-        stopped, at_minimum = bool(stored["stopped"]), bool(stored["at_minimum"])
+    last_x, best_x, at_minimum = x, x, False
     # Unregularised maps go on to fit noise after the scene is found. Held-out shots show when this begins.
     has_held_out = bool(np.any(problem.is_held_out))
     latest: _Evaluation | None = None
 
     def criterion() -> np.ndarray:
         return np.array([row[1] if has_held_out else row[2] for row in history])
+
+    def add_step(values: np.ndarray, misfits: tuple[float, float, float]) -> None:
+        nonlocal last_x, best_x
+        history.append(misfits)
+        last_x = values
+        if int(np.argmin(criterion())) == len(history) - 1:
+            best_x = values
+
+    while len(history) < max_steps and (stored := store.read(len(history))) is not None:
+        misfit, held_out_misfit, objective_value = stored["misfits"].tolist()
+        add_step(stored["x"], (misfit, held_out_misfit, objective_value))
+        at_minimum = bool(stored["at_minimum"])
+    stopped = bool(history) and no_longer_falls(criterion())
 
     def objective(scaled: np.ndarray) -> tuple[float, np.ndarray]:
         nonlocal latest
@@ -616,25 +636,15 @@ def _fit(
         return latest.objective, latest.gradient * scale
 
     def after_step(intermediate_result: Any) -> None:
-        nonlocal best_x, stopped
+        nonlocal stopped
         at = np.clip(intermediate_result.x * scale, problem.low, problem.high)
         # The last point of a line search is usually the accepted one; another has to be evaluated again.
         if latest is None or not np.array_equal(latest.x, at):
             objective(intermediate_result.x)
         assert latest is not None
-        history.append((latest.misfit, latest.held_out_misfit, latest.objective))
-        values = criterion()
-        if int(np.argmin(values)) == len(values) - 1:
-            best_x = latest.x
-        stopped = no_longer_falls(values)
-        store.add(
-            _ENTRY_OF_FIT,
-            x=latest.x,
-            best_x=best_x,
-            history=np.array(history),
-            stopped=stopped,
-            at_minimum=False,
-        )
+        add_step(latest.x, (latest.misfit, latest.held_out_misfit, latest.objective))
+        stopped = no_longer_falls(criterion())
+        store.write(len(history) - 1, x=last_x, misfits=history[-1], at_minimum=False)
         if progress is not None:
             progress(SceneStep("fit", len(history), latest.misfit, latest.held_out_misfit))
         # SciPy ends the minimisation at this exception, and returns its result as usual.
@@ -644,7 +654,7 @@ def _fit(
     if not (stopped or at_minimum) and len(history) < max_steps:
         result = optimize.minimize(
             objective,
-            x / scale,
+            last_x / scale,
             jac=True,
             method="L-BFGS-B",
             bounds=np.stack([problem.low / scale, problem.high / scale], axis=1),
@@ -656,14 +666,7 @@ def _fit(
         at_minimum = not stopped and result.status != 1
         if history:
             # A run that goes on from here does not repeat the fit.
-            store.add(
-                _ENTRY_OF_FIT,
-                x=best_x,
-                best_x=best_x,
-                history=np.array(history),
-                stopped=stopped,
-                at_minimum=at_minimum,
-            )
+            store.write(len(history) - 1, x=last_x, misfits=history[-1], at_minimum=at_minimum)
         else:
             # The start is a minimum: no step was taken.
             assert latest is not None
@@ -699,13 +702,13 @@ def _draws_of_error(
     end: _FitEnd,
     draws: int,
     key: PRNGKeyArray,
-    store: _Store,
+    store: _StoredSteps,
     progress: Callable[[SceneStep], None] | None,
 ) -> Float[np.ndarray, "draws n"]:
     """Draw errors of the values from the linearised posterior."""
     errors = np.zeros((draws, end.x.size))
     for number in range(draws):
-        if stored := store.entries.get(_FIRST_DRAW + number):
+        if stored := store.read(number):
             errors[number] = stored["error"]
             continue
         # The numbers of a draw do not depend on where a run was interrupted.
@@ -718,7 +721,7 @@ def _draws_of_error(
         of_bounds = np.sqrt(problem.bounds_precision) * random.normal(size=end.x.size)
         right_side = of_data + problem.priors.pull_back(end.x, of_priors) + of_bounds
         errors[number] = problem.solve(end, right_side)
-        store.add(_FIRST_DRAW + number, error=errors[number])
+        store.write(number, error=errors[number])
         if progress is not None:
             progress(SceneStep("errors", number + 1, end.misfit, end.held_out_misfit))
     return errors
@@ -728,7 +731,7 @@ def _averaging_kernels(
     problem: _Problem,
     end: _FitEnd,
     places: Mapping[str, np.ndarray],
-    store: _Store,
+    store: _StoredSteps,
     progress: Callable[[SceneStep], None] | None,
 ) -> dict[str, Float[np.ndarray, "places ..."]]:
     """Return rows of the averaging kernel, d estimate / d truth, within the unknown itself.
@@ -744,7 +747,7 @@ def _averaging_kernels(
         rows = []
         for index in places[u.name]:
             flat = int(start) + int(np.ravel_multi_index(tuple(index), u.start.shape))
-            stored = store.entries.get(_FIRST_KERNEL + number)
+            stored = store.read(number)
             if stored is None:
                 unit = np.zeros(end.x.size)
                 unit[flat] = 1.0
@@ -753,7 +756,7 @@ def _averaging_kernels(
                 if is_free[flat]:
                     column = problem.solve(end, unit, is_free)
                     row = problem.model.gauss_newton_product(end.x, column)
-                store.add(_FIRST_KERNEL + number, row=row)
+                store.write(number, row=row)
             else:
                 row = stored["row"]
             number += 1

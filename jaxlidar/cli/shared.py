@@ -11,7 +11,7 @@ import click
 
 from jaxlidar._progress import Progress, TaskProgress
 from jaxlidar.io import atomic_write
-from jaxlidar.io.stores import is_zarr
+from jaxlidar.io.store import is_zarr
 
 CASE_ARGUMENT = click.argument("case", type=click.Path(dir_okay=False, path_type=Path), metavar="CASE.toml")
 PLOT_OPTION = click.option(

@@ -19,8 +19,9 @@ from jaxlidar.cli.shared import (
 )
 from jaxlidar.instrument.lidar import Lidar
 from jaxlidar.io import Case, read_case
+from jaxlidar.io.netcdf import open as open_result
+from jaxlidar.io.store import is_zarr, remove_store, store_beside
 from jaxlidar.planning.plan import plan as make_plan
-from jaxlidar.survey.simulate_many import checkpoint_path
 
 # Arguments of `simulate` that `jaxlidar.plan` has, too.
 _PLAN_ARGUMENTS = ("rtol", "max_orders", "max_step", "n_rays", "window", "bin_width", "footprint", "effects")
@@ -83,18 +84,22 @@ def simulate(
 
 def _simulate_survey(case: Case, out: Path | None, plot: Path | None, quiet: bool) -> int:
     assert case.survey is not None
+    store = out if out is None or is_zarr(out) else store_beside(out)
     try:
         with survey_progress_bar(quiet, len(case.survey)) as show:
-            waveforms = case.simulate(show, out)
+            waveforms = case.simulate(show, store)
     except KeyboardInterrupt:
         if out is None:
             message = "finished shots are lost: give -o to keep them"
         else:
-            message = (
-                f"finished shots are kept in {checkpoint_path(out)}: the same command continues with them"
-            )
+            message = f"finished shots are kept in {store}: the same command continues with them"
         click.echo(f"jaxlidar: interrupted; {message}", err=True)
         return INTERRUPTED
+    if out is not None and store is not None and store != out:
+        waveforms.save(out, dataclasses.replace(case, lidar=None))
+        # The arrays of a store are read where they are used.
+        waveforms = open_result(out)
+        remove_store(store)
     click.echo(str(waveforms))
     if out is not None:
         click.echo(f"waveforms: {out}")

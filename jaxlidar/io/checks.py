@@ -18,7 +18,7 @@ MAX_EXACT_INTEGER = 2**53
 # light is slower by 3e-4; one part in a hundred leaves room for that and for rounded directions.
 TWO_WAY_METRES_PER_NS, TWO_WAY_TOLERANCE = SPEED_OF_LIGHT / 2, 0.01
 # What HDF5, h5netcdf, zarr and xarray raise for damaged files.
-_DAMAGED = (OSError, RuntimeError, ValueError, KeyError, TypeError, AttributeError, OverflowError)
+DAMAGE_ERRORS = (OSError, RuntimeError, ValueError, KeyError, TypeError, AttributeError, OverflowError)
 _FILTER = (
     "it is compressed by a filter that HDF5 lacks here: pip install hdf5plugin, and import hdf5plugin first"
 )
@@ -59,7 +59,7 @@ def refuse_damage(refusal: str) -> Iterator[None]:
     """Raise a ValueError that begins with `refusal` in place of what libraries raise for damaged files."""
     try:
         yield
-    except _DAMAGED as error:
+    except DAMAGE_ERRORS as error:
         # What HDF5 cannot read for another reason than damage.
         reason = next((text for words, text in _OTHER_REASONS.items() if words in str(error)), None)
         if reason is not None:

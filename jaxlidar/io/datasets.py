@@ -20,11 +20,10 @@ another size than in the group above. Such results are legitimate, so groups are
 """
 
 import dataclasses
-import hashlib
 import json
 import re
 import typing
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from importlib import metadata
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -38,9 +37,8 @@ from jaxlidar._not_kept import NotKept
 from jaxlidar.instrument.lidar import Lidar
 from jaxlidar.io.case import Case, case_of, case_text
 from jaxlidar.io.checks import refuse_damage
+from jaxlidar.io.groups import StoredArray, StoredGroups
 from jaxlidar.io.kinds import admits_tuple
-from jaxlidar.io.rows import CHECKSUMS, RowVariables, check_rows, unwritten_rows
-from jaxlidar.io.stores import Store
 from jaxlidar.io.toml import nearest
 from jaxlidar.scenes.scene import Scene
 
@@ -48,8 +46,8 @@ from jaxlidar.scenes.scene import Scene
 ENTRY_POINTS = "jaxlidar.files"
 # Classes of fields that are written as the TOML text of a case, and the field of the case.
 _CASE_FIELDS: dict[Any, str] = {Scene: "scene", Lidar: "lidar"}
-# Attributes of a group: the name of the class, and the checksum of its texts.
-KIND, _TEXT_DIGEST = "jaxlidar_kind", "text_sha256"
+# The attribute of a group with the name of the class.
+KIND = "jaxlidar_kind"
 
 
 class ResultLayout(NamedTuple):
@@ -62,18 +60,6 @@ class ResultLayout(NamedTuple):
     items: Mapping[str, str]
     coordinates: Mapping[str, str]
     rows: str | None
-
-    @property
-    def row_variables(self) -> RowVariables:
-        """Fields whose first dimension is that of rows, each of which is one variable."""
-        if self.rows is None:
-            return RowVariables((), "")
-        names = [
-            field.name
-            for field in dataclasses.fields(self.kind)
-            if (_dimensions(field.type) or [None])[0] == self.rows
-        ]
-        return RowVariables(tuple(names), self.dimensions.get(self.rows, self.rows))
 
     def items_of(self, field: str) -> str:
         """Dimension of the keys of a field that is a dict."""
@@ -108,8 +94,8 @@ def keep_as_netcdf(
     - `items`: names of the dimensions of the keys of dicts, by field. Default None: "FIELD_item".
     - `coordinates`: further fields that are coordinates, each with the dimension that it lies along. Default
       None: none.
-    - `rows`: a dimension of the annotations that is the first of some fields. Their values are written and
-      checked some rows at a time, and not read into memory. Default None: none.
+    - `rows`: a dimension of the annotations that is the first of some fields, which may be larger than
+      memory: those of a Zarr store beyond 64 MB are read where they are used. Default None: none.
 
     **Returns:** nothing.
 
@@ -176,15 +162,13 @@ def _dimensions(annotation: Any) -> list[str] | None:
 # -- to datasets -------------------------------------------------------------------------------------------
 
 
-def datasets_of(result: Any, group: str = "/", *, row_values: bool = True) -> dict[str, Any]:
+def datasets_of(result: Any, group: str = "/") -> dict[str, Any]:
     """Return a result as `xarray.Dataset`s by the path of their group: "/", "/truth", ...
 
     **Arguments:**
 
     - `result`: an object of a class that `keep_as_netcdf` knows.
     - `group`: path of its own group; those of objects in its fields lie below. Default "/".
-    - `row_values`: False gives row fields variables of the right shape and type whose values are zeros that
-      take no memory: their values are written later. Default True.
 
     **Returns:** a dict of `xarray.Dataset`.
 
@@ -195,7 +179,7 @@ def datasets_of(result: Any, group: str = "/", *, row_values: bool = True) -> di
     except ImportError as error:
         raise ImportError("datasets need xarray: pip install 'jaxlidar[io]'") from error
     layout = LAYOUTS[type(result).__name__]
-    builder = _DatasetBuilder(layout, () if row_values else layout.row_variables.names)
+    builder = _DatasetBuilder(layout)
     inner_datasets: dict[str, Any] = {}
     for field in dataclasses.fields(result):
         name, value = field.name, getattr(result, field.name)
@@ -213,13 +197,12 @@ def datasets_of(result: Any, group: str = "/", *, row_values: bool = True) -> di
             attributes, inner_datasets[f"{inner_group}_arrays"] = case_dataset(name, case)
             builder.attributes |= attributes
         elif type(value).__name__ in LAYOUTS:
-            inner_datasets |= datasets_of(value, inner_group, row_values=row_values)
+            inner_datasets |= datasets_of(value, inner_group)
         elif value is None:
             builder.add_static(name, value)
         else:
             raise TypeError(f"{name} is of the class {type(value).__name__}, which no file can hold")
     dataset = xarray.Dataset(builder.variables, attrs=builder.attributes).set_coords(list(layout.coordinates))
-    dataset.attrs[_TEXT_DIGEST] = _text_digest(dataset, layout)
     return {group: dataset, **{path: inner for path, inner in inner_datasets.items() if inner is not None}}
 
 
@@ -228,11 +211,10 @@ def case_dataset(name: str, case: Case) -> tuple[dict[str, str], Any]:
     import xarray
 
     text, arrays = case_text(case)
-    attributes = {name: text, f"{name}_sha256": hashlib.sha256(text.encode()).hexdigest()}
     variables = {
         key: ([f"{key}.{axis}" for axis in range(array.ndim)], array) for key, array in arrays.items()
     }
-    return attributes, xarray.Dataset(variables) if variables else None
+    return {name: text}, xarray.Dataset(variables) if variables else None
 
 
 def variables_by_item(dataset: Any, field: str) -> dict[str, str]:
@@ -245,8 +227,8 @@ def variables_by_item(dataset: Any, field: str) -> dict[str, str]:
 class _DatasetBuilder:
     """Variables and attributes of the Dataset of one object."""
 
-    def __init__(self, layout: ResultLayout, unwritten_fields: Collection[str]):
-        self.layout, self.unwritten_fields = layout, unwritten_fields
+    def __init__(self, layout: ResultLayout):
+        self.layout = layout
         self.variables: dict[str, Any] = {}
         self.attributes: dict[str, Any] = {"title": layout.title, KIND: layout.kind.__name__}
         self._sizes: dict[str, int] = {}
@@ -260,8 +242,6 @@ class _DatasetBuilder:
     def add_array(self, field: str, name: str, annotated: list[str], value: Any, **attrs: str) -> None:
         """Add the variable `name` with the units of a field, and with further attributes."""
         array, dimensions = np.asarray(value), self._named(name, annotated, np.ndim(value))
-        if field in self.unwritten_fields:
-            array = unwritten_rows(len(array), array)
         units, long_name = self.layout.quantities[field]
         self._sizes |= dict(zip(dimensions, array.shape))
         self.variables[name] = (dimensions, array, {"units": units, "long_name": long_name, **attrs})
@@ -279,8 +259,6 @@ class _DatasetBuilder:
         if not arrays:
             named = self._named(field, annotated, len(annotated))
             stacked = np.zeros((0, *(self._sizes[dimension] for dimension in named)))
-        elif field in self.unwritten_fields:
-            stacked = unwritten_rows(len(arrays), np.asarray(next(iter(arrays.values())))[None])
         else:
             stacked = np.stack([np.asarray(array) for array in arrays.values()])
         self.add_array(field, field, [keys, *annotated], stacked)
@@ -308,28 +286,10 @@ def _json_value(value: Any) -> Any:
     raise TypeError(f"a {type(value).__name__} is nothing that a file can hold")
 
 
-def _text_digest(dataset: Any, layout: ResultLayout) -> str:
-    """Checksum of the texts of a Dataset: netCDF has checksums for numbers alone.
-
-    The texts are the static fields, the keys in attributes, and the coordinates of texts.
-    """
-    variables = sorted(dataset.variables.items())
-    items = [(name, variable.attrs["item"]) for name, variable in variables if "item" in variable.attrs]
-    names = [
-        (name, [str(text) for text in variable.values])
-        for name, variable in variables
-        if variable.dtype.kind in "OUT" and variable.ndim == 1
-    ]
-    static = [field.name for field in dataclasses.fields(layout.kind) if field.metadata.get("static")]
-    attributes = [(name, str(dataset.attrs[name])) for name in static if name in dataset.attrs]
-    texts = [items, names, attributes]
-    return hashlib.sha256(json.dumps(texts).encode()).hexdigest()
-
-
 # -- from datasets -----------------------------------------------------------------------------------------
 
 
-def result_of(stored: Store, group: str = "/") -> Any:
+def result_of(stored: StoredGroups, group: str = "/") -> Any:
     """Return the object that a group holds, the inverse of `datasets_of`.
 
     **Arguments:** `stored`: the open file. `group`: path of the group. Default "/".
@@ -339,7 +299,7 @@ def result_of(stored: Store, group: str = "/") -> Any:
     return _GroupReader(stored, group).result()
 
 
-def case_of_group(stored: Store, name: str, group: str = "/") -> Case:
+def case_of_group(stored: StoredGroups, name: str, group: str = "/") -> Case:
     """Return the case that is an attribute of a group. **Raises:** as `result_of`."""
     return _GroupReader(stored, group).case(name)
 
@@ -347,12 +307,11 @@ def case_of_group(stored: Store, name: str, group: str = "/") -> Case:
 class _GroupReader:
     """Reads the object of one group."""
 
-    def __init__(self, stored: Store, group: str):
+    def __init__(self, stored: StoredGroups, group: str):
         self.stored, self.group, self.path = stored, group, stored.path
-        with refuse_damage(f"{self.path}: {group}: damaged"):
-            self.dataset = stored.dataset(group)
-        if self.dataset is None:
+        if group not in stored.datasets:
             raise ValueError(f"{self.path}: {group}: no such group")
+        self.dataset = stored.datasets[group]
 
     def _place(self, name: str) -> str:
         return f"{self.path}: {self.group.rstrip('/')}/{name}"
@@ -360,15 +319,7 @@ class _GroupReader:
     def result(self) -> Any:
         layout = layout_of(self._attribute(KIND), self.path)
         place = f"{self.path}: {self.group}"
-        with refuse_damage(f"{place}: damaged"):
-            is_intact = self.dataset.attrs.get(_TEXT_DIGEST) == _text_digest(self.dataset, layout)
-        if not is_intact:
-            raise ValueError(f"{place}: damaged (the checksum of its texts is another)")
         fields = {field.name: self._field(layout, field) for field in dataclasses.fields(layout.kind)}
-        if layout.rows is not None:
-            checksums = self._numbers(CHECKSUMS)
-            row_fields = {name: fields[name] for name in layout.row_variables.names}
-            check_rows(place, checksums, {n: v for n, v in row_fields.items() if not isinstance(v, NotKept)})
         try:
             return layout.kind(**fields)
         except (ValueError, TypeError) as error:
@@ -376,7 +327,7 @@ class _GroupReader:
 
     def _field(self, layout: ResultLayout, field: Any) -> Any:
         name, annotation = field.name, field.type
-        has_rows = name in layout.row_variables.names
+        has_rows = layout.rows is not None and (_dimensions(annotation) or [None])[0] == layout.rows
         if field.metadata.get("static"):
             return self._static(name, annotation)
         if (
@@ -394,6 +345,8 @@ class _GroupReader:
             arrays = self._array(name, item_annotation, has_rows)
             if len(arrays) != len(keys):
                 raise ValueError(f"{self._place(name)}: {len(arrays)} rows for {len(keys)} names")
+            if isinstance(arrays, StoredArray):
+                return {key: arrays.of_item(item) for item, key in enumerate(keys)}
             return dict(zip(keys, arrays))
         if annotation in _CASE_FIELDS:
             return getattr(self.case(name), _CASE_FIELDS[annotation])
@@ -405,8 +358,6 @@ class _GroupReader:
         if name not in self.dataset.attrs:
             raise ValueError(f"{self._place(name)}: no such attribute: it was saved without its case")
         text = self._attribute(name)
-        if hashlib.sha256(text.encode()).hexdigest() != self._attribute(f"{name}_sha256", name):
-            raise ValueError(f"{self._place(name)}: damaged (its checksum is another)")
 
         def read_array(file: str | None, key: str) -> np.ndarray:
             if file is not None:
@@ -415,8 +366,8 @@ class _GroupReader:
 
         return case_of(text, self.path, read_array)
 
-    def _attribute(self, name: str, place: str | None = None) -> str:
-        with refuse_damage(f"{self._place(place or name)}: damaged"):
+    def _attribute(self, name: str) -> str:
+        with refuse_damage(f"{self._place(name)}: damaged"):
             if name not in self.dataset.attrs:
                 raise ValueError(f"the attribute {name} is missing")
             return str(self.dataset.attrs[name])
@@ -440,13 +391,12 @@ class _GroupReader:
             variables = variables_by_item(self.dataset, field)
         return {item: self._array(name, annotation, False) for item, name in variables.items()}
 
-    def _numbers(self, name: str, has_rows: bool = False) -> np.ndarray:
+    def _numbers(self, name: str, has_rows: bool = False) -> Any:
         if name not in self.dataset.variables:
             raise ValueError(f"{self._place(name)}: no such variable")
         with refuse_damage(f"{self._place(name)}: damaged"):
-            if has_rows:
-                return self.stored.row_values(self.group, name)
-            return self.stored.values(self.group, name)
+            read = self.stored.rows if has_rows else self.stored.values
+            return read(self.group, name)
 
     def _array(self, name: str, annotation: Any, has_rows: bool) -> Any:
         array = self._numbers(name, has_rows)

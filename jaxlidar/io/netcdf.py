@@ -13,12 +13,10 @@ import numpy as np
 
 from jaxlidar._files import atomic_write
 from jaxlidar._fingerprint import version_of
-from jaxlidar._not_kept import NotKept
 from jaxlidar._registry import save_result
 from jaxlidar.instrument.photon_counter import PhotonEvents
 from jaxlidar.io.case import Case
 from jaxlidar.io.case import read_case as read_case_text
-from jaxlidar.io.checks import refuse_damage
 from jaxlidar.io.datasets import (
     KIND,
     LAYOUTS,
@@ -28,22 +26,14 @@ from jaxlidar.io.datasets import (
     keep_as_netcdf,
     result_of,
 )
-from jaxlidar.io.rows import BLOCK, CHECKSUMS, RowWriter
-from jaxlidar.io.stores import (
-    FORMAT,
-    NetcdfFile,
-    Store,
-    ZarrStore,
-    check_replaceable,
-    is_result_file,
-    is_zarr,
-)
+from jaxlidar.io.groups import StoredGroups, is_result_file, open_groups, write_groups
+from jaxlidar.io.store import check_replaceable, import_packages
 from jaxlidar.spectral.waveform import Waveform
 from jaxlidar.truth import Truth
 
 CONVENTIONS = "CF-1.11"
-# Number of the format of files. A reader refuses others: version 0.2 wrote format 1.
-FORMAT_NUMBER = 2
+# The attribute with the number of the format of files. A reader refuses others: version 0.2 wrote format 1.
+_FORMAT, FORMAT_NUMBER = "jaxlidar_format", 2
 # Reasons why a simulation stopped that depend on more than its arguments.
 _NOT_REPEATABLE = ("time spent", "interrupted")
 
@@ -84,8 +74,12 @@ def save(result: Any, path: str | os.PathLike[str], case: Case | None = None) ->
     """
     if case is not None:
         _check_case(result, case)
-    with _new_file(result, path, case) as file:
-        _write_rows(file, result, "/")
+    path = Path(path)
+    check_replaceable(path)
+    import_packages(path)
+    datasets = datasets_with_case(result, case)
+    with atomic_write(path) as draft:
+        write_groups(draft, datasets)
 
 
 def _check_case(result: Any, case: Case) -> None:
@@ -105,30 +99,15 @@ def _check_case(result: Any, case: Case) -> None:
         raise ValueError("the shots of the case have another position than the waveforms")
 
 
-@contextlib.contextmanager
-def by_rows(result: Any, path: str | os.PathLike[str], case: Case | None = None) -> Iterator[RowWriter]:
-    """Write a result whose rows are not known yet; the block adds them to the `RowWriter` that it is given.
+def datasets_with_case(result: Any, case: Case | None) -> dict[str, Any]:
+    """Return the datasets of a file by the path of their group, with its case and what describes its origin.
 
-    The arrays of `result` with rows must have the right shape and type, but their values do not count
-    (`jaxlidar.io.rows.unwritten_rows`). `case` is as for `save`.
+    **Raises:** TypeError for an object that no file can hold.
     """
-    with _new_file(result, path, case) as file:
-        writer = _row_writer(file, result, "/")
-        yield writer
-        writer.end()
-
-
-@contextlib.contextmanager
-def _new_file(result: Any, path: str | os.PathLike[str], case: Case | None) -> Iterator[Store]:
-    """Write a result but for its rows; the file appears under its name when the block ends."""
-    path, name = Path(path), type(result).__name__
+    name = type(result).__name__
     if name not in LAYOUTS or LAYOUTS[name].kind is not type(result):
         raise TypeError(f"result is of the class {name}; admissible are {', '.join(sorted(LAYOUTS))}")
-    check_replaceable(path)
-    store = ZarrStore if is_zarr(path) else NetcdfFile
-    store.import_packages()
-    datasets = datasets_of(result, row_values=False)
-    attributes = _file_attributes()
+    datasets, attributes = datasets_of(result), _file_attributes()
     if case is not None:
         case_attributes, arrays = case_dataset("case", case)
         attributes |= case_attributes
@@ -136,17 +115,7 @@ def _new_file(result: Any, path: str | os.PathLike[str], case: Case | None) -> I
             datasets["/case_arrays"] = arrays
     # A static field of the result may have the same name, as the `history` of a fit: that one stays.
     datasets["/"].attrs = attributes | datasets["/"].attrs
-    rows = {}
-    for group, dataset in datasets.items():
-        layout = LAYOUTS.get(dataset.attrs.get(KIND, ""))
-        if layout is not None and layout.rows is not None:
-            row_variables = layout.row_variables
-            names = tuple(name for name in row_variables.names if name in dataset.variables)
-            rows[group] = row_variables._replace(names=names)
-            checksums = np.zeros(dataset.sizes[rows[group].dimension], np.uint32)
-            datasets[group] = dataset.assign({CHECKSUMS: (rows[group].dimension, checksums)})
-    with atomic_write(path) as draft, store.create(draft, datasets, rows) as file:
-        yield file
+    return datasets
 
 
 def _file_attributes() -> dict[str, Any]:
@@ -155,51 +124,11 @@ def _file_attributes() -> dict[str, Any]:
         "Conventions": CONVENTIONS,
         "source": f"jaxlidar {version_of('jaxlidar')}",
         "history": f"{now}: written by jaxlidar.io.save",
-        FORMAT: FORMAT_NUMBER,
+        _FORMAT: FORMAT_NUMBER,
         "versions": json.dumps({p: version_of(p) for p in ("jaxlidar", "jax", "jaxlib", "numpy")}),
         "platform": jax.default_backend(),
         "precision": _precision(),
     }
-
-
-def _inner_results(result: Any, group: str) -> dict[str, tuple[Any, str]]:
-    """Return the objects of known classes in the fields of a result, each with its group, by field."""
-    return {
-        name: (value, f"{group.rstrip('/')}/{name}")
-        for name, value in vars(result).items()
-        if type(value).__name__ in LAYOUTS
-    }
-
-
-def _row_writer(file: Store, result: Any, group: str) -> RowWriter:
-    """Return the writer of the rows of a result, and of the objects in its fields that have rows."""
-    names = LAYOUTS[type(result).__name__].row_variables.names
-    fields = [name for name in names if not isinstance(getattr(result, name), NotKept)]
-    return RowWriter(
-        variables={name: file.variable(group, name) for name in fields},
-        items={name: list(v) for name in fields if isinstance(v := getattr(result, name), dict)},
-        checksums=file.variable(group, CHECKSUMS),
-        inner={
-            name: _row_writer(file, value, inner_group)
-            for name, (value, inner_group) in _inner_results(result, group).items()
-            if LAYOUTS[type(value).__name__].rows is not None
-        },
-    )
-
-
-def _write_rows(file: Store, result: Any, group: str) -> None:
-    """Write the rows of a result that is known, and those of the objects in its fields."""
-    if LAYOUTS[type(result).__name__].rows is None:
-        for value, inner_group in _inner_results(result, group).values():
-            _write_rows(file, value, inner_group)
-        return
-    writer = _row_writer(file, result, group)
-    values = {name: getattr(result, name) for name in (*writer.fields, *writer.inner)}
-    # Block by block: the arrays may be those of a file that is larger than memory.
-    for start in range(0, writer.count, BLOCK):
-        rows = slice(start, start + BLOCK)
-        writer.add(rows, jax.tree.map(lambda array, rows=rows: array[rows], values))
-    writer.end()
 
 
 def _precision() -> str:
@@ -208,40 +137,35 @@ def _precision() -> str:
 
 
 @contextlib.contextmanager
-def _open_file(path: str | os.PathLike[str]) -> Iterator[Store]:
+def _open_file(path: str | os.PathLike[str]) -> Iterator[StoredGroups]:
     """Open a file of `save`. **Raises:** as `open`."""
     path = Path(path)
-    with (ZarrStore if is_zarr(path) else NetcdfFile).open(path) as file:
-        attributes = _root_attributes(file)
+    with open_groups(path) as file:
+        attributes = file.datasets["/"].attrs
         if KIND not in attributes:
             raise ValueError(f"{path}: no attribute {KIND}: jaxlidar.io.save did not write it")
-        written = attributes.get(FORMAT)
+        written = attributes.get(_FORMAT)
         if written != FORMAT_NUMBER:
             raise ValueError(
-                f"{path}: {FORMAT} = {written}; admissible is {FORMAT_NUMBER}: "
+                f"{path}: {_FORMAT} = {written}; admissible is {FORMAT_NUMBER}: "
                 f"{attributes.get('source', 'another version of jaxlidar')} wrote the file"
             )
         yield file
 
 
-def _root_attributes(file: Store) -> dict[str, Any]:
-    with refuse_damage(f"{file.path}: the attributes: damaged"):
-        return dict(file.dataset("/").attrs)
-
-
 def open(path: str | os.PathLike[str]) -> Any:
     """Read a `Waveform`, or another result, from a file that `save` wrote.
 
-    Waveforms of surveys in netCDF files are compared with their checksums, but not read into memory: their
-    arrays are mapped (`numpy.memmap`), and read where they are used.
+    Waveforms of surveys in Zarr stores may be larger than memory: arrays beyond 64 MB are read where they are
+    used, by rows as in `many.reflectance[:100]`, or as a whole.
 
     **Arguments:** `path`: a file, or a Zarr store, of `jaxlidar.io.save`.
 
     **Returns:** an object of the class that was saved, with the same bits.
 
     **Raises:** FileNotFoundError where there is no such file. ValueError, naming the file and the place, for
-    one that is damaged, or not written by `save`, or whose class is not known. ImportError where xarray, and
-    h5netcdf or zarr, are not installed.
+    one that is damaged, incomplete, or not written by `save`, or whose class is not known. ImportError where
+    xarray, and h5netcdf or zarr, are not installed.
 
     **Example:**
 
@@ -317,7 +241,7 @@ def rerun(path: str | os.PathLike[str], progress: Callable[[Any], None] | None =
     """
     with _open_file(path) as file:
         case, wave = case_of_group(file, "case"), result_of(file)
-        precision = str(_root_attributes(file).get("precision"))
+        precision = str(file.datasets["/"].attrs.get("precision"))
     stopped = wave.info.get("stopped")
     if stopped in _NOT_REPEATABLE:
         raise ValueError(

@@ -62,7 +62,6 @@ keep_as_netcdf(
         "radiometric_constant": ("J m2", "energy times squared range per apparent reflectance"),
     },
     dimensions={"shots": "shot", "wavelengths": "wavelength", "lags": "lag"},
-    rows="shots",
 )
 
 

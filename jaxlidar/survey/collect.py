@@ -1,10 +1,13 @@
-"""`Waveforms` from the results of a strategy's tasks, in memory or, a few shots at a time, in a file."""
+"""`Waveforms` from the results of a strategy's tasks, in memory or in a store.
+
+A task computes the light, or the truth, of some shots, which are rows of arrays. Where shots are sums of the
+contributions of tasks, contributions are kept until all are there, and then summed block of shots by block.
+"""
 
 import dataclasses
-import itertools
-import os
+import json
 import time
-from collections.abc import Iterator, Mapping, MutableMapping
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -13,180 +16,250 @@ import numpy as np
 from jaxlidar._checks import warn_user
 from jaxlidar._summary import NOTABLE_FRACTION, percent, unfollowed_message
 from jaxlidar.io.case import Case
-from jaxlidar.io.checkpoint import Checkpoint
-from jaxlidar.io.netcdf import by_rows
-from jaxlidar.io.rows import unwritten_rows
+from jaxlidar.io.datasets import datasets_of
+from jaxlidar.io.groups import write_zarr_group
+from jaxlidar.io.netcdf import datasets_with_case
+from jaxlidar.io.store import ResultStore, consolidate, dataset_of_rows
 from jaxlidar.simulate import LateLightWarning, UnfollowedLightWarning
 from jaxlidar.spectral.apply_optics import make_waveform_model, refuse_excess
 from jaxlidar.survey.acquisition import Acquisition
 from jaxlidar.survey.results import ShotResults
-from jaxlidar.survey.strategy import AbstractStrategy
+from jaxlidar.survey.shared_illumination import GroupContribution
+from jaxlidar.survey.strategy import AbstractStrategy, Shots
+from jaxlidar.survey.truths import Truths
 from jaxlidar.survey.waveforms import Waveforms
 
+# The group of a store that has contributions until they are summed, and its number of rows of a chunk.
+_CONTRIBUTIONS, _CONTRIBUTIONS_PER_CHUNK = "contributions", 64
+# Quantities of `ShotResults` that `Waveforms` do not have, for the warnings of a run that goes on.
+_MISSING_LIGHT = {
+    "late": "fraction of the emitted light that returns after the end of the record",
+    "unfollowed": "fraction of the waveform that orders beyond the last may add",
+}
 
-class StoredResults(MutableMapping[int, Any]):
-    """Results of a survey's tasks by number, in a checkpoint."""
 
-    def __init__(self, checkpoint: Checkpoint, strategy: AbstractStrategy):
-        self.checkpoint, self.strategy = checkpoint, strategy
-        # Every entry is read once here: damaged ones are traced again with the missing ones.
-        self.numbers = {number for number, _ in checkpoint.intact_entries(self._decode)}
+class ShotsInMemory:
+    """Results of shots in memory.
 
-    def _decode(self, number: int, arrays: Mapping[str, np.ndarray]) -> Any:
-        if not 0 <= number < self.strategy.n_tasks:
-            raise ValueError(f"its number is outside the admissible range [0, {self.strategy.n_tasks - 1}]")
-        return _from_arrays(self.strategy.result_class(number), arrays)
+    - `is_done`: (shots,) True for the shots whose results are there.
+    - `values`: results with arrays of all shots; None without any result.
+    """
 
-    def __len__(self) -> int:
-        return len(self.numbers)
+    def __init__(self, count: int):
+        self.is_done = np.zeros(count, bool)
+        self.values: Any = None
 
-    def __iter__(self) -> Iterator[int]:
-        return iter(sorted(self.numbers))
+    def write(self, shots: Shots, results: Any) -> None:
+        """Add the results of some shots."""
+        if self.values is None:
+            count = len(self.is_done)
+            self.values = jax.tree.map(lambda a: np.zeros((count, *a.shape[1:]), a.dtype), results)
+        for values, of_shots in zip(jax.tree.leaves(self.values), jax.tree.leaves(results), strict=True):
+            values[shots] = of_shots
+        self.is_done[shots] = True
 
-    def __contains__(self, number: object) -> bool:
-        return number in self.numbers
 
-    def __getitem__(self, number: int) -> Any:
-        return _from_arrays(self.strategy.result_class(number), self.checkpoint.read(number))
+class StoredShots(NamedTuple):
+    """Results of shots in a store: which are there, as in `ShotsInMemory`, and how to add some."""
 
-    def __setitem__(self, number: int, result: Any) -> None:
-        self.checkpoint.add(number, _as_arrays(result))
-        self.numbers.add(number)
+    is_done: np.ndarray
+    write: Callable[[Shots, Any], None]
 
-    def __delitem__(self, number: int) -> None:
-        raise TypeError("results in a checkpoint are not deleted")
+
+class StoredContributions:
+    """Contributions of tasks by number, in a store: the rows of a task are its shots."""
+
+    def __init__(self, store: ResultStore, strategy: AbstractStrategy):
+        numbers = range(strategy.n_contributions)
+        counts = [np.arange(len(strategy.survey))[strategy.shots_of_task(n)].size for n in numbers]
+        ends = np.cumsum([0, *counts]).tolist()
+        self._slices = [slice(*ends[n : n + 2]) for n in range(len(counts))]
+        self._rows = store.rows(_CONTRIBUTIONS, "row", ends[-1], _CONTRIBUTIONS_PER_CHUNK)
+
+    def __contains__(self, number: int) -> bool:
+        return number < len(self._slices) and bool(np.all(self._rows.is_done[self._slices[number]]))
+
+    def __setitem__(self, number: int, contribution: GroupContribution) -> None:
+        arrays = {}
+        for field, value in contribution._asdict().items():
+            items = value.items() if isinstance(value, dict) else [("", value)]
+            arrays |= {f"{field}.{item}": array for item, array in items}
+        self._rows.write(self._slices[number], dataset_of_rows("row", arrays))
+
+    def __getitem__(self, number: int) -> GroupContribution:
+        fields: dict[str, Any] = {}
+        for name, array in self._rows.read(self._slices[number]).items():
+            field, _, item = name.partition(".")
+            if item:
+                fields.setdefault(field, {})[item] = array
+            else:
+                fields[field] = array
+        return GroupContribution(**fields)
+
+
+@dataclasses.dataclass(frozen=True)
+class SurveyResults:
+    """Results of the tasks of a strategy.
+
+    - `light`, `truth`: those of shots. - `contributions`: those of tasks, by number.
+    """
+
+    strategy: AbstractStrategy
+    light: ShotsInMemory | StoredShots
+    truth: ShotsInMemory | StoredShots
+    contributions: dict[int, GroupContribution] | StoredContributions
+
+    @staticmethod
+    def in_memory(strategy: AbstractStrategy) -> "SurveyResults":
+        """Return results in memory, of which none is there yet."""
+        count = len(strategy.survey)
+        return SurveyResults(strategy, ShotsInMemory(count), ShotsInMemory(count), {})
+
+    def _rows(self, number: int) -> ShotsInMemory | StoredShots:
+        return self.light if number < self.strategy.n_light_tasks else self.truth
+
+    def is_done(self, number: int) -> bool:
+        """Return True for a task that need not be run."""
+        are_done = self._rows(number).is_done[self.strategy.shots_of_task(number)]
+        return number in self.contributions or bool(np.all(are_done))
+
+    def add(self, number: int, result: Any) -> None:
+        """Add the result of a task."""
+        if number < self.strategy.n_contributions:
+            self.contributions[number] = result
+        else:
+            results = self.strategy.results_of_task(number, result)
+            self._rows(number).write(self.strategy.shots_of_task(number), results)
+
+    def sum_contributions(self) -> None:
+        """Add the light of all shots whose contributions are there."""
+        for shots in self.strategy.shot_slices if self.strategy.n_contributions else ():
+            if not np.all(self.light.is_done[shots]):
+                self.light.write(
+                    shots, self.strategy.sum_contributions(self.contributions.__getitem__, shots)
+                )
 
 
 def waveforms_in_memory(
-    strategy: AbstractStrategy,
-    survey_fields: dict[str, Any],
-    task_results: Mapping[int, Any],
-    start_time: float,
-    **info: Any,
+    results: SurveyResults, survey_fields: dict[str, Any], start_time: float, **info: Any
 ) -> Waveforms:
-    """Return all waveforms.
+    """Return all waveforms from the results of all tasks.
 
     `survey_fields`: the fields of `Waveforms` that are known before any tracing. `info`: further entries of
     `Waveforms.info`.
     """
-    # Blocks come in the order of shots.
-    blocks = [results for _, results in strategy.shot_results(task_results)]
-    results: ShotResults = jax.tree.map(lambda *a: np.concatenate(a), *blocks)
-    refuse_excess(results.excess)
-    _warn_of_missing_light(strategy, _MissingLight.of(results))
-    return _waveforms(strategy, {**survey_fields, **results.waveform_fields()}, start_time, **info)
+    assert isinstance(results.light, ShotsInMemory)
+    assert isinstance(results.truth, ShotsInMemory)
+    light: ShotResults = results.light.values
+    refuse_excess(light.excess)
+    _warn_of_missing_light(results.strategy, light.late, light.unfollowed)
+    fields = {**survey_fields, **light.waveform_fields(), "truth": results.truth.values}
+    return _waveforms(results.strategy, fields, _info(results.strategy, start_time) | info)
 
 
-def waveforms_on_disk(
-    strategy: AbstractStrategy,
-    survey_fields: dict[str, Any],
-    task_results: Mapping[int, Any],
-    start_time: float,
-    path: str | os.PathLike[str],
-    case: Case | None,
-    **info: Any,
-) -> Waveforms:
-    """Write all waveforms to a file, block of shots by block, with their case if there is one, and open it.
+class StoredSurvey:
+    """The store of a survey, with the layout of `Waveforms`: `jaxlidar.open` reads it when it is finished.
 
-    `info`: further entries of `Waveforms.info`.
+    `survey_fields`: as in `waveforms_in_memory`. `case`: that of the survey, or None.
     """
-    blocks, missing = strategy.shot_results(task_results), _MissingLight()
-    first_shots, first_results = next(blocks)
-    # The file is laid out before its rows are known: from the shapes of the first block.
-    empty = jax.tree.map(lambda a: unwritten_rows(len(strategy.survey), a), first_results.waveform_fields())
-    layout = _waveforms(strategy, {**survey_fields, **empty}, start_time, **info)
-    with by_rows(layout, path, case) as rows:
-        # One block of results is in memory at a time, whatever the number of shots.
-        for shots, results in itertools.chain([(first_shots, first_results)], blocks):
-            refuse_excess(results.excess)
-            fields = {name: _rows(value, shots) for name, value in survey_fields.items()}
-            rows.add(shots, {**fields, **results.waveform_fields()})
-            missing = missing.or_more(_MissingLight.of(results))
-    _warn_of_missing_light(strategy, missing)
-    return Waveforms.open(path)
+
+    def __init__(
+        self,
+        store: ResultStore,
+        strategy: AbstractStrategy,
+        survey_fields: dict[str, Any],
+        case: Case | None,
+    ):
+        self._store, self._strategy, self._survey_fields, self._case = store, strategy, survey_fields, case
+        count, chunk = len(strategy.survey), strategy.shot_slices[0].stop
+        self._light = store.rows("", "shot", count, chunk)
+        light, truth = StoredShots(self._light.is_done, self._write_light), ShotsInMemory(count)
+        self._has_truth = strategy.n_tasks > strategy.n_light_tasks
+        if self._has_truth:
+            self._truth = store.rows("truth", "shot", count, chunk)
+            truth = StoredShots(self._truth.is_done, self._write_truth)
+        contributions = StoredContributions(store, strategy) if strategy.n_contributions else {}
+        if damaged := store.damaged_arrays():
+            warn_user(
+                f"path = {store.path} is damaged, and these arrays are made again: {', '.join(damaged)}"
+            )
+            # They are written with the first shots that are traced.
+            light.is_done[:chunk] = truth.is_done[:chunk] = False
+        self.results = SurveyResults(strategy, light, truth, contributions)
+
+    def _write_light(self, shots: Shots, results: ShotResults) -> None:
+        refuse_excess(results.excess)
+        fields = {
+            # An acquisition is a group of its own, which is written once for all shots.
+            name: value if isinstance(value, Acquisition) else value[shots]
+            for name, value in self._survey_fields.items()
+        }
+        waveforms = _waveforms(self._strategy, {**fields, **results.waveform_fields()}, {})
+        if self._light.has_layout:
+            datasets = datasets_of(waveforms)
+        else:
+            datasets = datasets_with_case(waveforms, self._case)
+            for path in datasets.keys() - {"/"}:
+                write_zarr_group(self._store.path, path, datasets[path])
+        missing_light = {
+            name: ("shot", getattr(results, name), {"units": "1", "long_name": long_name})
+            for name, long_name in _MISSING_LIGHT.items()
+        }
+        dataset = datasets["/"].assign(missing_light)
+        # `finish` writes `info`. A truth, which is another task's, is a group and no attribute.
+        left_out = {"info", "truth"} if self._has_truth else {"info"}
+        dataset.attrs = {name: value for name, value in dataset.attrs.items() if name not in left_out}
+        self._light.write(shots, dataset)
+
+    def _write_truth(self, shots: Shots, truths: Truths) -> None:
+        self._truth.write(shots, datasets_of(truths, "/truth")["/truth"])
+
+    def finish(self, start_time: float, **info: Any) -> None:
+        """Write what is known when all tasks are done."""
+        root = self._store.root
+        if _CONTRIBUTIONS in root:
+            del root[_CONTRIBUTIONS]
+        # A store that was finished before stays as it is, but for chunks that were damaged.
+        if "info" not in root.attrs:
+            _warn_of_missing_light(self._strategy, *(root[name][:] for name in _MISSING_LIGHT))
+            root.attrs["info"] = json.dumps(_info(self._strategy, start_time) | info, default=float)
+        consolidate(self._store.path)
 
 
-def _rows(value: Any, shots: slice) -> Any:
-    """Return the rows of some shots: of an array, or of the fields of an `Acquisition` that have rows."""
-    if not isinstance(value, Acquisition):
-        return value[shots]
-    columns = ("gps_time", "scan_angle", "flight_line", "range_at_time_zero")
-    return dataclasses.replace(value, **{name: getattr(value, name)[shots] for name in columns})
-
-
-def _waveforms(
-    strategy: AbstractStrategy, fields: dict[str, Any], start_time: float, **info: Any
-) -> Waveforms:
+def _info(strategy: AbstractStrategy, start_time: float) -> dict[str, Any]:
+    """Return the entries of `Waveforms.info`."""
     altitude = strategy.setup.lidar.altitude
+    return {
+        "rtol": strategy.rtol,
+        "orders": strategy.setup.plan.orders,
+        "altitude": None if altitude is None else float(altitude),
+        "seconds": time.perf_counter() - start_time,
+        **strategy.info(),
+    }
+
+
+def _waveforms(strategy: AbstractStrategy, fields: dict[str, Any], info: dict[str, Any]) -> Waveforms:
     return Waveforms(
         time=np.asarray(make_waveform_model(strategy.setup).time),
         wavelength=np.asarray(strategy.setup.lidar.wavelength),
         **fields,
-        info={
-            "rtol": strategy.rtol,
-            "orders": strategy.setup.plan.orders,
-            "altitude": None if altitude is None else float(altitude),
-            "seconds": time.perf_counter() - start_time,
-            **strategy.info(),
-            **info,
-        },
+        info=info,
     )
 
 
-class _MissingLight(NamedTuple):
-    """Largest fractions of all shots of light that waveforms lack; see `ShotResults`."""
+def _warn_of_missing_light(strategy: AbstractStrategy, late: np.ndarray, unfollowed: np.ndarray) -> None:
+    """Warn if much light of a shot is after the record, or may be in orders that were not followed.
 
-    late: float = 0.0
-    unfollowed: float = 0.0
-
-    @staticmethod
-    def of(results: ShotResults) -> "_MissingLight":
-        """Return the missing light of some shots."""
-        return _MissingLight(*(float(np.max(a, initial=0.0)) for a in (results.late, results.unfollowed)))
-
-    def or_more(self, second: "_MissingLight") -> "_MissingLight":
-        """Return the larger of each fraction."""
-        return _MissingLight(*map(max, self, second))
-
-
-def _warn_of_missing_light(strategy: AbstractStrategy, missing: _MissingLight) -> None:
-    """Warn if much light of a shot is after the record, or may be in orders that were not followed."""
+    `late`, `unfollowed`: (shots,) as in `ShotResults`.
+    """
     plan = strategy.setup.plan
-    if plan.scope.automatic_orders and missing.unfollowed > strategy.rtol:
-        warn_user(unfollowed_message(plan.orders, missing.unfollowed), UnfollowedLightWarning)
-    if missing.late >= NOTABLE_FRACTION:
+    most_late, most_unfollowed = (float(np.max(a, initial=0.0)) for a in (late, unfollowed))
+    if plan.scope.automatic_orders and most_unfollowed > strategy.rtol:
+        warn_user(unfollowed_message(plan.orders, most_unfollowed), UnfollowedLightWarning)
+    if most_late >= NOTABLE_FRACTION:
         end = plan.sample_start + plan.sample_interval * plan.n_samples
         warn_user(
-            f"{percent(missing.late)} of the light of a shot is still on its way when the record ends at "
+            f"{percent(most_late)} of the light of a shot is still on its way when the record ends at "
             f"{end:.4g} ns: see Waveforms.energy_budget",
             LateLightWarning,
         )
-
-
-def _as_arrays(result: Any) -> dict[str, np.ndarray]:
-    """Return the arrays of a result by name.
-
-    Those of a dict are named "field/item", and a dict without items has the name "field/" and an empty array.
-    Fields that are None are left out.
-    """
-    arrays, fields = {}, vars(result) if dataclasses.is_dataclass(result) else result._asdict()
-    for field, value in fields.items():
-        if isinstance(value, dict):
-            # Files of arrays know no dicts: without a name of its own, an empty one would be lost.
-            items = {f"{field}/{item}": array for item, array in value.items()}
-            arrays |= items or {f"{field}/": np.empty(0)}
-        elif value is not None:
-            arrays[field] = value
-    return arrays
-
-
-def _from_arrays(result_class: Any, arrays: Mapping[str, np.ndarray]) -> Any:
-    """Return the result of that class from its arrays, the inverse of `_as_arrays`."""
-    fields: dict[str, Any] = {}
-    for name, array in arrays.items():
-        field, slash, item = name.partition("/")
-        if not slash:
-            fields[field] = array
-        else:
-            fields.setdefault(field, {}).update({item: array} if item else {})
-    return result_class(**fields)

@@ -27,7 +27,6 @@ get more parts, as many as the error of each asks for.
 
 import dataclasses
 import math
-from collections.abc import Iterator, Mapping
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -56,7 +55,7 @@ from jaxlidar.spectral.apply_optics import (
     total_samples,
 )
 from jaxlidar.survey.results import ShotErrors, ShotResults, make_shot_results
-from jaxlidar.survey.strategy import AbstractStrategy, slices_of_shots
+from jaxlidar.survey.strategy import AbstractStrategy, Shots, first_rows, slices_of_shots
 from jaxlidar.trace.device_scene import DeviceScene, aim_at, build_device_scene
 from jaxlidar.trace.first_order import FirstOrderTally
 from jaxlidar.trace.footprint import RaySlice, interleaving_shifts, make_beam
@@ -196,14 +195,11 @@ class PerShotStrategy(AbstractStrategy):
     def shot_slices(self) -> list[slice]:
         return slices_of_shots(len(self.survey), self.shots_per_chunk)
 
-    def result_class(self, number: int) -> type[ShotResults]:
-        return ShotResults
+    def shots_of_task(self, number: int) -> Shots:
+        return self.shot_slices[number]
 
-    def shot_results(self, task_results: Mapping[int, Any]) -> Iterator[tuple[slice, ShotResults]]:
-        for number, shots in enumerate(self.shot_slices):
-            # Without the copies that fill up the last chunk.
-            count = shots.stop - shots.start
-            yield shots, jax.tree.map(lambda a, n=count: a[:n], task_results[number])
+    def results_of_task(self, number: int, result: Any) -> ShotResults:
+        return first_rows(result, self.shot_slices[number])
 
     def info(self) -> dict[str, Any]:
         return {"shared": False}

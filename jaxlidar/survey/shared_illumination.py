@@ -35,7 +35,7 @@ s^2 (r / sqrt(s))^2 = s r^2, then add up to r^2. A group has as many batches as 
 
 import dataclasses
 import functools
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable
 from typing import Any, NamedTuple
 
 import jax
@@ -67,7 +67,7 @@ from jaxlidar.spectral.apply_optics import (
 )
 from jaxlidar.survey.node_groups import NodeAllocation, NodeGroup
 from jaxlidar.survey.results import ShotErrors, ShotResults, make_shot_results
-from jaxlidar.survey.strategy import AbstractStrategy, slices_of_shots
+from jaxlidar.survey.strategy import AbstractStrategy, Shots, slices_of_shots
 from jaxlidar.survey.view_geometry import ViewGeometry
 from jaxlidar.trace.device_scene import DeviceScene, aim_at, build_device_scene
 from jaxlidar.trace.entry_nodes import EntryNodes
@@ -136,19 +136,22 @@ class SharedIlluminationStrategy(AbstractStrategy):
     def shot_slices(self) -> list[slice]:
         return slices_of_shots(len(self.survey), SHOTS_PER_BLOCK)
 
-    def result_class(self, number: int) -> "type[GroupContribution]":
-        return GroupContribution
+    @property
+    def n_contributions(self) -> int:
+        return len(self.groups)
 
-    def shot_results(self, task_results: Mapping[int, Any]) -> Iterator[tuple[slice, ShotResults]]:
-        for shots in self.shot_slices:
-            numbers = [
-                number
-                for number, group in enumerate(self.groups)
-                if np.any((group.shots >= shots.start) & (group.shots < shots.stop))
-            ]
-            # One contribution at a time is in memory: the mapping may be one of files.
-            contributions = (task_results[number] for number in numbers)
-            yield shots, sum_contributions(self.context, contributions, shots, self.kept_names)
+    def shots_of_task(self, number: int) -> Shots:
+        return self.groups[number].shots
+
+    def sum_contributions(self, contribution_of: Callable[[int], Any], shots: slice) -> ShotResults:
+        numbers = [
+            number
+            for number, group in enumerate(self.groups)
+            if np.any((group.shots >= shots.start) & (group.shots < shots.stop))
+        ]
+        # One contribution at a time is in memory: they may be in a store.
+        contributions = map(contribution_of, numbers)
+        return sum_contributions(self.context, contributions, shots, self.kept_names)
 
     def info(self) -> dict[str, Any]:
         return {
@@ -225,7 +228,7 @@ class BatchSums(NamedTuple):
 class GroupContribution(NamedTuple):
     """Contribution of a group to its shots.
 
-    - `shots`: their numbers. - `lines`: components (the name is that in checkpoints): samples by material,
+    - `shots`: their numbers. - `lines`: components: samples by material,
       then those of the first order, then the relative energy.
     - `energy`: as in `BatchSums`. - `variance`, `energy_variance`: squared standard errors of the waveform
       and of the energy. - `photons`: number of photons that contribute.

@@ -3,15 +3,15 @@
 1. Check the arguments.
 2. Choose the strategy that cuts the shots into tasks: per shot (`per_shot`), shared illumination
    (`shared_illumination`), or, for a scene larger than memory, one of these for each tile (`tiled_scene`).
-3. Run the tasks: in this process, on its devices, or by workers. With a `path`, results go to a checkpoint as
-   they come, and a later call runs the remaining tasks alone.
-4. Collect their results in `Waveforms` (`collect`).
+3. Run the tasks: in this process, on its devices, or by workers.
+4. Collect their results in `Waveforms` (`collect`). With a `path`, they go to a store as they come, and a
+   later call runs the remaining tasks alone.
 """
 
 import functools
 import os
 import time
-from collections.abc import Callable, Collection, Iterator, Mapping, MutableMapping
+from collections.abc import Callable, Collection, Iterator
 from concurrent.futures import Executor
 from pathlib import Path
 from typing import Any
@@ -35,15 +35,14 @@ from jaxlidar._registry import simulate_survey
 from jaxlidar._workers import WorkUnit, outcomes
 from jaxlidar.instrument.survey import Survey
 from jaxlidar.io.case import Case, case_text
-from jaxlidar.io.checkpoint import check_same_problem, open_checkpoint
+from jaxlidar.io.store import check_store_path, open_store
 from jaxlidar.scenes.scene import Scene, check_kinds
 from jaxlidar.scenes.scene_parts import SceneParts
 from jaxlidar.survey.acquisition import acquisition_of
 from jaxlidar.survey.choose_strategy import choose_strategy
-from jaxlidar.survey.collect import StoredResults, waveforms_in_memory, waveforms_on_disk
+from jaxlidar.survey.collect import StoredSurvey, SurveyResults, waveforms_in_memory
 from jaxlidar.survey.coverage import OffMapWarning, ground_heights, is_cut_off, off_map, off_map_message
 from jaxlidar.survey.results import OPTIONAL_ARRAYS
-from jaxlidar.survey.strategy import AbstractStrategy
 from jaxlidar.survey.tiled_scene import TiledSceneStrategy
 from jaxlidar.survey.truths import StrategyWithTruth
 from jaxlidar.survey.waveforms import Waveforms
@@ -98,11 +97,11 @@ def simulate_many(
       the standard error.
     - `max_orders`: follow exactly this many scatterings, whatever `rtol` needs; at least 1. Default None:
       from `rtol` and the optics.
-    - `path`: a netCDF file, or a Zarr store (".zarr"), for the waveforms. It appears when all are traced,
-      with its case, so that `jaxlidar.rerun` can simulate them again. Until then the file "PATH.parts" (of
-      SQLite) has the results so far; the same call continues with them, also after it was killed. One run at
-      a time can use it. If the file exists already, it is read. Only a few shots are in memory at a time,
-      also of a netCDF file that is returned: see `jaxlidar.open`. Default None: no file.
+    - `path`: a Zarr store, whose name ends in ".zarr", for the waveforms as they come, with their case, so
+      that `jaxlidar.rerun` can simulate them again. The same call goes on with what is there, also after it
+      was killed; where all is there, it reads it. Damaged chunks are named in a warning and their shots
+      traced again. One run at a time can use it. Only a few shots are in memory at a time, also of what is
+      returned: its arrays beyond 64 MB are read where they are used. Default None: no store.
     - `executor`: a `concurrent.futures.Executor`, whose workers do tasks (chunks of shots, groups of nodes of
       the grid, or tiles of the scene): a process pool (with the start method "spawn" or "forkserver"), that
       of a Dask client (`client.get_executor()`; the extra `cluster` installs Dask), of mpi4py. A task whose
@@ -129,8 +128,8 @@ def simulate_many(
     **Raises:** TypeError for arguments of another class, and inside a JAX transformation. ValueError, before
     any work, for inadmissible arguments, a scene that reaches up to the sensor, shots that do not meet the
     ground, a receiver whose window opens at the first return, shots that must share light and cannot, and a
-    `path` with results of another problem, naming what differs. OSError for a `path` that another run uses,
-    or that cannot be written. RuntimeError where the workers of a task die twice.
+    `path` that is no Zarr store, or has results of another problem, naming what differs. OSError for a `path`
+    that another run uses, or that cannot be written. RuntimeError where the workers of a task die twice.
 
     **Example:**
 
@@ -147,6 +146,8 @@ def simulate_many(
         check_kinds(survey.lidar, scene)
     check_key(key)
     check_kind("path", path, str | os.PathLike | None, "a path, or None")
+    if path is not None:
+        check_store_path(Path(path))
     check_kind("executor", executor, Executor | None, "a concurrent.futures.Executor, or None")
     check_kind("mesh", mesh, jax.sharding.Mesh | None, "a jax.sharding.Mesh, or None")
     devices = None if mesh is None else _devices(mesh, executor)
@@ -187,8 +188,9 @@ def simulate_many(
     run_tasks = functools.partial(outcomes, executor=executor, devices=devices)
     info: dict[str, Any] = {"automatic orders": max_orders is None}
     if path is None:
-        task_results = _trace(strategy, key, run_tasks, progress, {})
-        return waveforms_in_memory(strategy, survey_fields, task_results, start_time, **info)
+        results = SurveyResults.in_memory(strategy)
+        _trace(results, key, run_tasks, progress)
+        return waveforms_in_memory(results, survey_fields, start_time, **info)
 
     # Digests of all that the waveforms depend on: results of another problem are neither used nor
     # overwritten.
@@ -202,39 +204,21 @@ def simulate_many(
             "max_orders": max_orders,
             "shared": strategy.info()["shared"],
             "truth": bool(truth),
-            # Files of earlier versions, which have all arrays, do not name them.
-            **({} if kept_names == OPTIONAL_ARRAYS else {"keep": kept_names}),
+            "keep": kept_names,
         }
     )
-    path = Path(path)
-    if path.exists():
-        return _open_complete(path, problem)
     arguments = {"rtol": rtol, "max_orders": max_orders, "shared": shared, "truth": truth}
     arguments |= {} if keep is None else {"keep": kept_names}
     case = None if isinstance(scene, SceneParts) else _case(survey, scene, key, arguments)
-    with open_checkpoint(checkpoint_path(path), problem) as checkpoint:
-        # Another run of the same problem may have ended since.
-        if path.exists():
-            checkpoint.remove()
-            return _open_complete(path, problem)
-        stored_results = StoredResults(checkpoint, strategy)
+    with open_store(path, problem) as store:
+        stored_survey = StoredSurvey(store, strategy, survey_fields, case)
         try:
-            task_results = _trace(strategy, key, run_tasks, progress, stored_results)
+            _trace(stored_survey.results, key, run_tasks, progress)
         except KeyboardInterrupt as error:
-            error.add_note(
-                f"finished shots are kept in {checkpoint_path(path)}: the same call continues with them"
-            )
+            error.add_note(f"finished shots are kept in {path}: the same call continues with them")
             raise
-        info["problem"] = problem
-        waveforms = waveforms_on_disk(strategy, survey_fields, task_results, start_time, path, case, **info)
-        checkpoint.remove()
-    return waveforms
-
-
-def checkpoint_path(path: str | os.PathLike[str]) -> Path:
-    """Return the path of the results so far of a survey that is written to `path`."""
-    path = Path(path)
-    return path.with_name(path.name + ".parts")
+        stored_survey.finish(start_time, **info)
+    return Waveforms.open(path)
 
 
 def _kept_names(keep: Collection[str] | None) -> tuple[str, ...]:
@@ -259,13 +243,6 @@ def _check_not_transformed(survey: Survey, scene: Scene | SceneParts, key: PRNGK
             "the tolerance of every shot is met. Call it outside, or use simulate for each shot, with plan= "
             "made outside"
         )
-
-
-def _open_complete(path: Path, problem: dict[str, str]) -> Waveforms:
-    """Open a complete file, which stands for the call that made it; refuse one of another problem."""
-    waveforms = Waveforms.open(path)
-    check_same_problem(path, waveforms.info.get("problem", {}), problem)
-    return waveforms
 
 
 def _case(survey: Survey, scene: Scene, key: PRNGKeyArray, arguments: dict[str, Any]) -> Case | None:
@@ -296,21 +273,21 @@ def _devices(mesh: jax.sharding.Mesh, executor: Executor | None) -> list[Any]:
 
 
 def _trace(
-    strategy: AbstractStrategy,
+    results: SurveyResults,
     key: PRNGKeyArray,
     run_tasks: Callable[[list[WorkUnit]], Iterator[tuple[WorkUnit, Any]]],
     progress: Callable[[TaskProgress], None] | None,
-    task_results: MutableMapping[int, Any],
-) -> Mapping[int, Any]:
-    """Run the tasks without a result yet, and return the results of all tasks by number."""
-    tasks, shots = strategy.tasks(key), len(strategy.survey)
-    n_done = len(task_results)
+) -> None:
+    """Run the tasks without a result yet, until the results of all shots are there."""
+    tasks, shots = results.strategy.tasks(key), len(results.strategy.survey)
+    missing_tasks = [t for t in tasks if not results.is_done(t.number)]
+    n_done = len(tasks) - len(missing_tasks)
     # Shots are counted in proportion to tasks: with shared illumination no task has shots of its own.
     start_time, stored = time.perf_counter(), shots * n_done // len(tasks)
-    for unit, result in run_tasks([t for t in tasks if t.number not in task_results]):
-        task_results[unit.number] = result
+    for unit, result in run_tasks(missing_tasks):
+        results.add(unit.number, result)
         n_done += 1
         if progress is not None:
             seconds = time.perf_counter() - start_time
             progress(TaskProgress(shots * n_done // len(tasks), shots, seconds, stored=stored))
-    return task_results
+    results.sum_contributions()

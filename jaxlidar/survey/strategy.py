@@ -2,15 +2,20 @@
 
 import abc
 import dataclasses
-from collections.abc import Iterator, Mapping
-from typing import Any
+from collections.abc import Callable
+from typing import Any, TypeAlias
 
-from jaxtyping import PRNGKeyArray
+import jax
+import numpy as np
+from jaxtyping import Int, PRNGKeyArray
 
 from jaxlidar._workers import WorkUnit
 from jaxlidar.instrument.survey import Survey
 from jaxlidar.planning.setup import Setup
 from jaxlidar.survey.results import ShotResults
+
+# Shots of a task: a slice, or their numbers.
+Shots: TypeAlias = slice | Int[np.ndarray, " shots"]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -41,17 +46,31 @@ class AbstractStrategy(abc.ABC):
         """Number of tasks."""
 
     @property
+    def n_light_tasks(self) -> int:
+        """Number of tasks that trace light; those after them find the truth. Default: all."""
+        return self.n_tasks
+
+    @property
+    def n_contributions(self) -> int:
+        """Number of tasks, the first ones, of which shots are sums (`sum_contributions`). Default: none."""
+        return 0
+
+    @property
     @abc.abstractmethod
     def shot_slices(self) -> list[slice]:
-        """Shots of each block of results; all blocks but the last are of one size."""
+        """Blocks of shots that are completed or stored together; all but the last are of one size."""
 
     @abc.abstractmethod
-    def result_class(self, number: int) -> Any:
-        """Return the class of a task's result, whose fields are arrays or dicts of arrays."""
+    def shots_of_task(self, number: int) -> Shots:
+        """Return the shots of a task: their numbers, or a slice."""
 
-    @abc.abstractmethod
-    def shot_results(self, task_results: Mapping[int, Any]) -> Iterator[tuple[slice, ShotResults]]:
-        """Yield the results of all `shot_slices`, from the results of all tasks by number."""
+    def results_of_task(self, number: int, result: Any) -> Any:
+        """Return the results of exactly the shots of a task, a `ShotResults` or `Truths`, from its own."""
+        return result
+
+    def sum_contributions(self, contribution_of: Callable[[int], Any], shots: slice) -> ShotResults:
+        """Return the results of one of `shot_slices`; `contribution_of` gives the contribution of a task."""
+        raise NotImplementedError("no task is a contribution")
 
     @abc.abstractmethod
     def info(self) -> dict[str, Any]:
@@ -61,3 +80,8 @@ class AbstractStrategy(abc.ABC):
 def slices_of_shots(shots: int, size: int) -> list[slice]:
     """Return slices of `size` shots; the last one may be shorter."""
     return [slice(first, min(first + size, shots)) for first in range(0, shots, size)]
+
+
+def first_rows(results: Any, shots: slice) -> Any:
+    """Return the results of a slice of shots, without the copies that fill up the last chunk."""
+    return jax.tree.map(lambda a: a[: shots.stop - shots.start], results)

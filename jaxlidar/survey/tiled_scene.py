@@ -18,7 +18,6 @@ record and their margins.
 """
 
 import dataclasses
-from collections.abc import Iterator, Mapping
 from typing import Any, NamedTuple
 
 import jax
@@ -32,16 +31,17 @@ from jaxlidar.instrument.survey import Survey
 from jaxlidar.scenes.scene import check_kinds
 from jaxlidar.scenes.scene_parts import SceneParts
 from jaxlidar.survey.choose_strategy import choose_strategy
+from jaxlidar.survey.collect import ShotsInMemory, SurveyResults
 from jaxlidar.survey.coverage import ground_heights, off_map
 from jaxlidar.survey.results import ShotResults
-from jaxlidar.survey.strategy import AbstractStrategy, slices_of_shots
+from jaxlidar.survey.strategy import AbstractStrategy, Shots, slices_of_shots
 from jaxlidar.survey.truths import StrategyWithTruth, Truths
 
 # Radius within which a Gaussian beam is followed, over its 1/e^2 radius; 2e-8 of its energy lies beyond. It
 # is larger than in `footprint_splines`: what lies outside the rectangle is missing altogether.
 _GAUSSIAN_EXTENT = 3.0
-# Shots whose results are completed together, and tiles whose results stay in memory for the next ones.
-_SHOTS_PER_BLOCK, _CACHED_TILES = 256, 4
+# Shots of a chunk of a store.
+_SHOTS_PER_BLOCK = 256
 # Rectangles reach beyond tiles by multiples of the tile's edge over this.
 _STEPS = 10
 
@@ -232,40 +232,18 @@ class TiledSceneStrategy(AbstractStrategy):
     def shot_slices(self) -> list[slice]:
         return slices_of_shots(len(self.survey), _SHOTS_PER_BLOCK)
 
-    def result_class(self, number: int) -> type[ShotResults | Truths]:
-        return ShotResults if number < len(self.tiles) else Truths
+    @property
+    def n_light_tasks(self) -> int:
+        return len(self.tiles)
 
-    def shot_results(self, task_results: Mapping[int, Any]) -> Iterator[tuple[slice, ShotResults]]:
-        """Yield results in the order of shots, from those of tiles.
+    def shots_of_task(self, number: int) -> Shots:
+        return self.tiles[number % len(self.tiles)].shots
 
-        Successive shots are mostly of few tiles: the results of the last ones stay in memory, since reading
-        those of a tile from a file for every block would take long.
-        """
-        tile_of_shot, row_of_shot = (np.empty(len(self.survey), int) for _ in range(2))
-        for n, tile in enumerate(self.tiles):
-            tile_of_shot[tile.shots], row_of_shot[tile.shots] = n, np.arange(len(tile.shots))
-        cache: dict[int, ShotResults] = {}
-        for shots in self.shot_slices:
-            results_by_tile, positions = [], []
-            for n in np.unique(tile_of_shot[shots]):
-                # Taken out and put in again: the tile used last is at the end, the one used longest ago is
-                # dropped.
-                results = cache.pop(int(n), None)
-                results = self._results_of_tile(int(n), task_results) if results is None else results
-                cache[int(n)] = results
-                position = np.flatnonzero(tile_of_shot[shots] == n)
-                positions.append(position)
-                rows = row_of_shot[shots][position]
-                results_by_tile.append(jax.tree.map(lambda a, r=rows: a[r], results))
-                while len(cache) > _CACHED_TILES:
-                    del cache[next(iter(cache))]
-            # Back from the order of tiles to that of shots.
-            order = np.argsort(np.concatenate(positions), kind="stable")
-            yield shots, jax.tree.map(lambda *a, o=order: np.concatenate(a)[o], *results_by_tile)
-
-    def _results_of_tile(self, number: int, task_results: Mapping[int, Any]) -> ShotResults:
+    def results_of_task(self, number: int, result: Any) -> ShotResults | Truths:
         """Return the results of a tile, with zeros for the materials that its part of the scene lacks."""
-        results: ShotResults = task_results[number]
+        if number >= self.n_light_tasks:
+            return self._truths_of_tile(result)
+        results: ShotResults = result
         energy_budget, energy_budget_stderr = (
             None
             if a is None
@@ -277,23 +255,21 @@ class TiledSceneStrategy(AbstractStrategy):
         components = results.components
         if components is not None:
             components = _in_order_of_names(components, self.materials, np.zeros_like(components["first"]))
-        truth = None
-        if self.options.truth:
-            truths: Truths = task_results[number + len(self.tiles)]
-            no_height = np.full(len(truths.top_height), np.nan)
-            plan, samples = self.setup.plan, truths.gap_probability
-            nothing = np.zeros((len(samples), results.neglected.shape[1], plan.n_samples), samples.dtype)
-            truth = dataclasses.replace(
-                truths,
-                returns=_in_order_of_names(truths.returns, self.materials, nothing),
-                surface_height=_in_order_of_names(truths.surface_height, self.surfaces, no_height),
-                surface_spread=_in_order_of_names(truths.surface_spread, self.surfaces, no_height),
-            )
         return results._replace(
             components=components,
             energy_budget=energy_budget,
             energy_budget_stderr=energy_budget_stderr,
-            truth=truth,
+        )
+
+    def _truths_of_tile(self, truths: Truths) -> Truths:
+        no_height = np.full(len(truths.top_height), np.nan)
+        samples, n_wavelengths = truths.gap_probability, self.survey.lidar.wavelength.size
+        nothing = np.zeros((len(samples), n_wavelengths, self.setup.plan.n_samples), samples.dtype)
+        return dataclasses.replace(
+            truths,
+            returns=_in_order_of_names(truths.returns, self.materials, nothing),
+            surface_height=_in_order_of_names(truths.surface_height, self.surfaces, no_height),
+            surface_spread=_in_order_of_names(truths.surface_spread, self.surfaces, no_height),
         )
 
     def info(self) -> dict[str, Any]:
@@ -355,8 +331,12 @@ def trace_tile(
     # With the window and the orders of all tiles the strategy comes out as in `TiledSceneStrategy.of`.
     strategy = _strategy_of_tile(survey, scene, tile, options)
     task_results = _run_in_turn(strategy.tasks(jax.random.fold_in(key, number)))
-    blocks = [results for _, results in strategy.shot_results(task_results)]
-    return jax.tree.map(lambda *a: np.concatenate(a), *blocks)
+    results = SurveyResults.in_memory(strategy)
+    for task_number, result in task_results.items():
+        results.add(task_number, result)
+    results.sum_contributions()
+    assert isinstance(results.light, ShotsInMemory)
+    return results.light.values
 
 
 def truth_of_tile(

@@ -1,7 +1,7 @@
 """Truth of the shots of a survey: reference quantities of what each beam meets in the scene."""
 
 import dataclasses
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable
 from typing import Any, final
 
 import equinox as eqx
@@ -19,7 +19,7 @@ from jaxlidar.planning.setup import Setup
 from jaxlidar.spectral.apply_optics import make_waveform_model
 from jaxlidar.survey.per_shot import ShotGeometry, aim_offset, setup_of_shot, shot_geometry
 from jaxlidar.survey.results import ShotResults
-from jaxlidar.survey.strategy import AbstractStrategy
+from jaxlidar.survey.strategy import AbstractStrategy, Shots, first_rows
 from jaxlidar.trace.device_scene import DeviceScene, aim_at, build_device_scene
 from jaxlidar.truth import Truth, compute_labels, first_order_setup
 
@@ -110,15 +110,30 @@ class StrategyWithTruth(AbstractStrategy):
     def n_tasks(self) -> int:
         return self.light_strategy.n_tasks + len(self.shot_slices)
 
-    def result_class(self, number: int) -> Any:
-        return self.light_strategy.result_class(number) if number < self.light_strategy.n_tasks else Truths
+    @property
+    def n_light_tasks(self) -> int:
+        return self.light_strategy.n_tasks
 
-    def shot_results(self, task_results: Mapping[int, Any]) -> Iterator[tuple[slice, ShotResults]]:
-        results_of_slices = self.light_strategy.shot_results(task_results)
-        for number, (shots, results) in enumerate(results_of_slices, self.light_strategy.n_tasks):
-            count = shots.stop - shots.start
-            truths = jax.tree.map(lambda a, n=count: a[:n], task_results[number])
-            yield shots, results._replace(truth=truths)
+    @property
+    def n_contributions(self) -> int:
+        return self.light_strategy.n_contributions
+
+    def shots_of_task(self, number: int) -> Shots:
+        n_light = self.n_light_tasks
+        return (
+            self.light_strategy.shots_of_task(number)
+            if number < n_light
+            else self.shot_slices[number - n_light]
+        )
+
+    def results_of_task(self, number: int, result: Any) -> ShotResults | Truths:
+        n_light = self.n_light_tasks
+        if number < n_light:
+            return self.light_strategy.results_of_task(number, result)
+        return first_rows(result, self.shot_slices[number - n_light])
+
+    def sum_contributions(self, contribution_of: Callable[[int], Any], shots: slice) -> ShotResults:
+        return self.light_strategy.sum_contributions(contribution_of, shots)
 
     def info(self) -> dict[str, Any]:
         return self.light_strategy.info()

@@ -70,8 +70,7 @@ class Waveforms(eqx.Module):
       whether light was "shared" (over `SceneParts`: in all tiles). Over one scene with shared light, also the
       spacing in m of the "grid" of nodes at which it entered, and a bound on the fraction of samples that
       "parallel light" changes. Over `SceneParts`, also the number of "parts", the "margin" in m around tiles,
-      and the "margin of all light", which loses none. If there is a file, also "problem": digests of all that
-      the waveforms depend on.
+      and the "margin of all light", which loses none.
 
     **Example:**
 
@@ -411,11 +410,12 @@ class Waveforms(eqx.Module):
         return datasets["/"].merge(datasets["/truth"]) if self.truth is not None else datasets["/"]
 
     def save(self, path: str | os.PathLike[str], case: Case | None = None) -> None:
-        """Write the waveforms as a netCDF file, which `Waveforms.open` and `jaxlidar.open` read.
+        """Write the waveforms as netCDF or Zarr, which `Waveforms.open` and `jaxlidar.open` read.
 
         **Arguments:**
 
-        - `path`: the file to write. It appears when it is complete. Missing folders are created.
+        - `path`: the file to write, or the folder of a Zarr store (".zarr"). It appears when it is complete.
+          Missing folders are created.
         - `case`: the `jaxlidar.io.Case` of the survey that was simulated, so that `jaxlidar.rerun` can do it
           again. Default None: not kept.
 
@@ -425,7 +425,9 @@ class Waveforms(eqx.Module):
 
     @staticmethod
     def open(path: str | os.PathLike[str]) -> "Waveforms":
-        """The waveforms of a netCDF file that `save` or `simulate_many` wrote, with the same bits.
+        """The waveforms of a file that `save`, or of a store that `simulate_many` wrote, with the same bits.
+
+        Arrays of a Zarr store beyond 64 MB are read where they are used.
 
         **Arguments:** `path`: the file.
 

@@ -133,7 +133,7 @@ def test_an_interrupted_survey_says_where_finished_shots_are(tmp_path, capsys, m
     case.write_text(SURVEY)
     monkeypatch.setattr("jaxlidar.io.case.simulate_survey", interrupted)
     assert cli.main(["simulate", str(case), "-o", str(out)]) == 130
-    assert f"kept in {out}.parts: the same command continues" in capsys.readouterr().err
+    assert f"kept in {out}.zarr: the same command continues" in capsys.readouterr().err
     assert cli.main(["simulate", str(case)]) == 130
     assert "give -o to keep them" in capsys.readouterr().err
 

@@ -294,7 +294,7 @@ def test_from_file_to_table(example, shared, tmp_path, case):
     repeated_rows = example("fit_airborne").main([*arguments, "--out", str(tmp_path)])
     assert len(rows) == count
     assert [row.get("ground") for row in rows] == [row.get("ground") for row in repeated_rows]
-    assert {path.suffix for path in tmp_path.iterdir()} == {".csv", ".nc", ".png", ".sqlite"}
+    assert {path.suffix for path in tmp_path.iterdir()} == {".csv", ".nc", ".png", ".zarr", ".lock"}
     assert all(row["quality"] in ("good", "doubtful", "bad") for row in rows)
     assert all(row["reasons"] for row in rows if row["quality"] != "good")
     fitted_rows = [row for row in rows if "ground" in row]

@@ -106,7 +106,7 @@ def test_damaged_shots_are_not_good(example, gedi):
 
 @pytest.mark.slow
 def test_gedi_from_file_to_table(example, gedi, tmp_path, capsys):
-    """One shot, twice: the second time from the checkpoint, with the same row."""
+    """One shot, twice: the second time from the store, with the same row."""
     arguments = [str(gedi), "--shot", str(SHOTS[0]), "--out", str(tmp_path)]
     (row,), _ = example("fit_gedi").main(arguments)
     (repeated_row,), _ = example("fit_gedi").main(arguments)
@@ -114,5 +114,5 @@ def test_gedi_from_file_to_table(example, gedi, tmp_path, capsys):
     assert row["ground"] == repeated_row["ground"] == pytest.approx(797.9, abs=0.5)
     assert row["shot_number"] == SHOTS[0]
     kinds = {path.suffix for path in tmp_path.iterdir()}
-    assert kinds == {".csv", ".nc", ".png", ".sqlite"}
+    assert kinds == {".csv", ".nc", ".png", ".zarr", ".lock"}
     assert "1 good, 0 doubtful, 0 bad" in capsys.readouterr().out

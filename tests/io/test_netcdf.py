@@ -1,8 +1,9 @@
-"""Results as netCDF: exact round trips, units, cases that can be run again, damage, and old files."""
+"""Results as netCDF and Zarr: exact round trips, units, cases that can be run again, damage, old files."""
 
-import builtins
 import dataclasses
 import json
+import pickle
+import sys
 from importlib import metadata
 
 import equinox as eqx
@@ -13,8 +14,8 @@ from jaxtyping import Float
 
 import inversion
 import jaxlidar as jl
-from jaxlidar.io import datasets
-from tests.helpers import slow_unless
+from jaxlidar.io import datasets, groups
+from tests.io.test_store import flip_a_bit
 
 h5py = pytest.importorskip("h5py")
 
@@ -98,13 +99,14 @@ def same(result, expected):
     return jax.tree.structure(result) == jax.tree.structure(expected) and same_classes and same_bits
 
 
+@pytest.mark.parametrize("suffix", [".nc", ".zarr"])
 @pytest.mark.parametrize("name", ["wave", "fit", "fits"])
-def test_results_are_read_as_they_were_written(name, request, tmp_path):
-    result = request.getfixturevalue(name)
-    jl.io.save(result, tmp_path / "a.nc")
-    assert same(jl.open(tmp_path / "a.nc"), result)
+def test_results_are_read_as_they_were_written(name, suffix, request, tmp_path):
+    result, path = request.getfixturevalue(name), tmp_path / f"a{suffix}"
+    jl.io.save(result, path)
+    assert same(jl.open(path), result)
     changed = eqx.tree_at(lambda r: jax.tree.leaves(r)[0], result, replace_fn=lambda x: x + 1)
-    assert not same(jl.open(tmp_path / "a.nc"), changed)
+    assert not same(jl.open(path), changed)
 
 
 def test_double_precision_is_kept_when_jax_reads_in_single_precision(wave, tmp_path):
@@ -179,43 +181,6 @@ def test_every_quantity_of_a_registered_class_has_units():
             assert names - {"scene", "waveform", "truth", "acquisition"} == set(layout.quantities)
 
 
-@pytest.mark.parametrize("name", slow_unless(["wave"], ["wave", "fits"]))
-def test_damaged_files_are_refused_by_name(name, request, tmp_path):
-    """A file with one changed byte is refused, unless the result is unchanged."""
-    result, path = request.getfixturevalue(name), tmp_path / "a.nc"
-    jl.io.save(result, path)
-    content, n_refusals = path.read_bytes(), 0
-    rng = np.random.default_rng(5)
-    for offset in rng.integers(0, len(content), 60):
-        byte = bytes([content[offset] ^ rng.integers(1, 256)])
-        path.write_bytes(content[:offset] + byte + content[offset + 1 :])
-        try:
-            result_of_damaged_file = jl.open(path)
-        except ValueError as error:
-            assert str(error).startswith(str(path))  # noqa: PT017
-            n_refusals += 1
-        else:
-            assert same(result_of_damaged_file, result), offset
-    assert n_refusals > 5
-    for size in (0, 7, 100, len(content) // 2, len(content) - 1):
-        path.write_bytes(content[:size])
-        with pytest.raises(ValueError, match=r"a.nc: "):
-            jl.open(path)
-
-
-@pytest.mark.parametrize("at", [0, 24])
-def test_a_damaged_heap_of_names_is_refused(wave, tmp_path, at):
-    """HDF5 would stay for ever at an object of number 0 and size 0: the first, or one behind it."""
-    path = tmp_path / "a.nc"
-    jl.io.save(wave, path)
-    content = bytearray(path.read_bytes())
-    start = content.index(b"GCOL") + 16 + at
-    content[start : start + 48] = bytes(48)
-    path.write_bytes(content)
-    with pytest.raises(ValueError, match=r"a\.nc: damaged \(the heap at byte"):
-        jl.open(path)
-
-
 def test_damaged_values_are_refused_with_the_name_of_their_variable(wave, tmp_path):
     path = tmp_path / "a.nc"
     wave.save(path)
@@ -273,17 +238,12 @@ def test_a_class_of_another_package_is_loaded_by_its_entry_point(tmp_path, monke
     assert jl.open(tmp_path / "a.nc").top.tolist() == [1.0, 2.0]
 
 
-def test_missing_h5netcdf_names_the_extra_to_install(wave, tmp_path, monkeypatch):
-    original_import = builtins.__import__
-
-    def import_without_h5netcdf(name, *args, **kwargs):
-        if name == "h5netcdf":
-            raise ImportError(name)
-        return original_import(name, *args, **kwargs)
-
-    monkeypatch.setattr(builtins, "__import__", import_without_h5netcdf)
-    with pytest.raises(ImportError, match=r"pip install 'jaxlidar\[io\]'"):
-        wave.save(tmp_path / "a.nc")
+@pytest.mark.parametrize(("package", "suffix"), [("h5netcdf", ".nc"), ("zarr", ".zarr")])
+def test_missing_packages_are_named_with_the_extra_to_install(wave, tmp_path, monkeypatch, package, suffix):
+    # Python raises an ImportError for such an entry.
+    monkeypatch.setitem(sys.modules, package, None)
+    with pytest.raises(ImportError, match=rf"need {package}: pip install 'jaxlidar\[io\]'"):
+        wave.save(tmp_path / f"a{suffix}")
     assert list(tmp_path.iterdir()) == []
 
 
@@ -296,10 +256,108 @@ def test_a_failed_write_leaves_the_old_file(wave, tmp_path):
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_damaged_text_is_refused(wave, tmp_path):
+@pytest.mark.parametrize("size", [0, 7, 100, 20_000, -1])
+def test_files_that_were_cut_are_refused_by_name(wave, tmp_path, size):
     path = tmp_path / "a.nc"
     wave.save(path)
-    with h5py.File(path, "r+") as file:
-        file["component"][0] = "fist"
-    with pytest.raises(ValueError, match=r"a.nc: /: damaged \(the checksum of its texts is another\)"):
+    path.write_bytes(path.read_bytes()[:size])
+    with pytest.raises(ValueError, match=r"a.nc: "):
         jl.open(path)
+
+
+# -- Zarr --------------------------------------------------------------------------------------------------
+
+
+def test_zarr_stores_have_the_case_and_are_opened_by_xarray(wave, case, tmp_path):
+    wave.save(path := tmp_path / "flat.zarr", case)
+    assert jl.open(path).info == wave.info
+    assert np.array_equal(jl.rerun(path).reflectance, wave.reflectance)
+    xarray = pytest.importorskip("xarray")
+    # xarray would warn of a store without consolidated metadata.
+    data = xarray.open_zarr(path, decode_timedelta=False, chunks=None)
+    assert data.reflectance.dims == ("wavelength", "time")
+    assert data.energy.attrs["units"] == "J"
+
+
+def test_damaged_zarr_stores_are_refused_by_array(wave, tmp_path):
+    wave.save(path := tmp_path / "a.zarr")
+    flip_a_bit(chunk := path / "energy" / "c" / "0" / "0")
+    with pytest.raises(ValueError, match=r"a.zarr: /energy: damaged"):
+        jl.open(path)
+    chunk.unlink()
+    with pytest.raises(ValueError, match=r"a.zarr: /energy: damaged \(1 chunks are missing\)"):
+        jl.open(path)
+    (path / "energy" / "zarr.json").write_text("{")
+    with pytest.raises(ValueError, match=r"a.zarr: .*damaged"):
+        jl.open(path)
+    (path / "zarr.json").unlink()
+    with pytest.raises(ValueError, match=r"a.zarr: no Zarr store of version 3: it has no zarr.json"):
+        jl.open(path)
+    with pytest.raises(FileNotFoundError, match=r"b.zarr: no such folder"):
+        jl.open(tmp_path / "b.zarr")
+
+
+def test_a_folder_that_is_no_zarr_store_is_not_overwritten(wave, tmp_path):
+    (folder := tmp_path / "a.zarr").mkdir()
+    (folder / "thesis.txt").write_text("years of work")
+    with pytest.raises(ValueError, match=r"a.zarr: it is there already and no Zarr store; nothing is over"):
+        wave.save(folder)
+    assert (folder / "thesis.txt").exists()
+
+
+class ShotEnergies(eqx.Module):
+    """A result whose fields `energy` and `by_material` have a row for every shot."""
+
+    energy: Float[np.ndarray, "shots bins"]
+    by_material: dict[str, Float[np.ndarray, "shots bins"]]
+
+
+def test_rows_of_zarr_stores_are_read_where_they_are_used(tmp_path, monkeypatch):
+    monkeypatch.setitem(datasets.LAYOUTS, "ShotEnergies", None)
+    monkeypatch.setattr(ShotEnergies, "__init__", lambda self, **fields: vars(self).update(fields))
+    quantities = {"energy": ("J", "energy"), "by_material": ("J", "energy by material")}
+    jl.io.keep_as_netcdf(
+        ShotEnergies, "shot energies", quantities, dimensions={"shots": "shot"}, rows="shots"
+    )
+    energy = np.random.default_rng(0).normal(size=(1000, 250)).astype(np.float32)
+    jl.io.save(
+        ShotEnergies(energy=energy, by_material={"leaf": 2 * energy, "ground": -energy}),
+        path := tmp_path / "a.zarr",
+    )
+    assert isinstance(jl.open(path).energy, np.ndarray)
+    monkeypatch.setattr(groups, "_BYTES_READ_AT_ONCE", 1000)
+    result = jl.open(path)
+    assert isinstance(result.energy, groups.StoredArray)
+    reads, oindex = [], type(result.energy._array.oindex).__getitem__
+    monkeypatch.setattr(
+        type(result.energy._array.oindex),
+        "__getitem__",
+        lambda self, i: (reads.append(i), oindex(self, i))[1],
+    )
+    for array, expected in ((result.energy, energy), (result.by_material["ground"], -energy)):
+        assert (array.shape, array.ndim, array.dtype, len(array)) == ((1000, 250), 2, np.float32, 1000)
+        mask = np.arange(1000) % 7 == 3
+        for index in (3, -1, slice(5, 9), slice(None, None, -300), [4, 2, 4], mask, (3, 5), (slice(2, 5), 7)):
+            reads.clear()
+            np.testing.assert_array_equal(array[index], expected[index])
+            assert len(reads) == 1
+            rows = reads[0][-1]
+            assert len(range(*rows.indices(1000)) if isinstance(rows, slice) else rows) < 150
+        # What is no index of rows is NumPy's.
+        for index in (..., (..., 0), None, (slice(None), slice(3))):
+            np.testing.assert_array_equal(array[index], expected[index])
+        np.testing.assert_array_equal(array.sum(axis=1), expected.sum(axis=1))
+        np.testing.assert_array_equal(
+            np.sqrt(2.0 * array**2) > 0.1 - array, np.sqrt(2.0 * expected**2) > 0.1 - expected
+        )
+        np.testing.assert_array_equal(jax.numpy.asarray(array), expected)
+        np.testing.assert_array_equal(pickle.loads(pickle.dumps(array))[3], expected[3])
+        with pytest.raises(IndexError):
+            array[1000]
+        with pytest.raises(AttributeError):
+            array.no_such_method()
+    for chunk in (path / "energy" / "c").rglob("*"):
+        if chunk.is_file():
+            flip_a_bit(chunk)
+    with pytest.raises(ValueError, match=r"a\.zarr: /energy: damaged"):
+        result.energy[3]

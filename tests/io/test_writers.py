@@ -20,7 +20,6 @@ import jaxlidar as jl
 from jaxlidar import _files, cli
 from jaxlidar.cli.shared import new_axes, save_figure
 from jaxlidar.io import atomic_write
-from jaxlidar.io.checkpoint import open_checkpoint
 from tests.io.test_las_waveforms import small_shots
 
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="links, pipes and modes of POSIX")
@@ -177,22 +176,6 @@ def test_what_no_content_can_be_written_to_is_refused_before_the_block(tmp_path,
     with pytest.raises(OSError, match="symbolic link") as caught:
         atomic_write(loop).__enter__()
     assert caught.value.errno == errno.ELOOP
-
-
-def test_a_checkpoint_is_a_regular_file_with_the_modes_of_the_umask(tmp_path):
-    os.mkfifo(tmp_path / "pipe")
-    with (
-        pytest.raises(OSError, match="pipe cannot be written: it is no regular file"),
-        open_checkpoint(tmp_path / "pipe", {"scene": "0"}),
-    ):
-        pass
-    os.umask(0o002)
-    link, target = tmp_path / "link", tmp_path / "fits.sqlite"
-    link.symlink_to(target)
-    with open_checkpoint(link, {"scene": "0"}) as checkpoint:
-        checkpoint.add(0, {"x": np.ones(2)})
-    assert mode(target) == 0o664
-    assert link.is_symlink()
 
 
 def test_the_longest_name(tmp_path):

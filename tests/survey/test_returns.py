@@ -291,7 +291,7 @@ def test_files_hold_the_acquisition(tmp_path, waveforms):
 
 def test_surveys_that_are_written_as_they_come_have_returns(tmp_path, survey, waveforms):
     on_disk = jl.simulate_many(
-        survey, SCENE, key=jax.random.key(0), truth=True, max_orders=1, path=tmp_path / "a.nc"
+        survey, SCENE, key=jax.random.key(0), truth=True, max_orders=1, path=tmp_path / "a.zarr"
     )
     np.testing.assert_array_equal(on_disk.returns().position, waveforms.returns().position)
 

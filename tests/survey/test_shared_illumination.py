@@ -236,7 +236,7 @@ def test_shared_illumination_does_not_depend_on_workers_or_interrupts(tmp_path):
         if progress.done > 100:
             raise Stopped
 
-    path = tmp_path / "many.nc"
+    path = tmp_path / "many.zarr"
     with pytest.raises(Stopped):
         jl.simulate_many(survey, stand(), key=KEY, **options, path=path, progress=stop)
     assert same(waveforms, jl.simulate_many(survey, stand(), key=KEY, **options, path=path))

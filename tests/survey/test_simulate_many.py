@@ -1,25 +1,28 @@
 """Surveys against single simulations: agreement, repeatability, interrupted runs, workers, bad input."""
 
 import concurrent.futures
-import contextlib
 import dataclasses
+import errno
 import multiprocessing
 import os
-import sqlite3
 import subprocess
 import sys
 import warnings
 from pathlib import Path
 
+import filelock
 import jax
 import numpy as np
 import pytest
+import zarr
 
 import jaxlidar as jl
+from jaxlidar.io.store import StoredRows
 from jaxlidar.sampling.adaptive import StopReason
 from jaxlidar.survey import choose_strategy, coverage
 from jaxlidar.survey.coverage import ground_heights, off_map
 from jaxlidar.survey.footprint_splines import fit_footprints
+from tests.io.test_store import flip_a_bit
 from tests.quick_compilation import optimise_programs
 
 KEY = jax.random.key(5)
@@ -353,14 +356,13 @@ class Stopped(Exception):
     pass
 
 
-def stored_tasks(path):
-    """Return the numbers of the tasks in the checkpoint of a run that writes `path`."""
-    with contextlib.closing(sqlite3.connect(f"{path}.parts")) as connection:
-        return {number for (number,) in connection.execute("SELECT number FROM entries")}
+def stored_shots(path, group=""):
+    """Return the shots whose results a store has, read without the code under test."""
+    return set(np.flatnonzero(zarr.open_array(path / group / "done", mode="r")[:]).tolist())
 
 
 def test_an_interrupted_run_continues(tmp_path):
-    survey, scene, path = nadir(16), stand(), tmp_path / "many.nc"
+    survey, scene, path = nadir(16), stand(), tmp_path / "many.zarr"
     uninterrupted = jl.simulate_many(survey, scene, key=KEY, **FAST)
 
     def stop(progress):
@@ -369,19 +371,19 @@ def test_an_interrupted_run_continues(tmp_path):
 
     with pytest.raises(Stopped):
         jl.simulate_many(survey, scene, key=KEY, **FAST, path=path, progress=stop)
-    assert not path.exists()
-    n_stored = len(stored_tasks(path))
-    assert n_stored >= 3
+    n_stored = len(stored_shots(path))
+    assert n_stored >= 6
+    with pytest.raises(ValueError, match=rf"many\.zarr: /: {16 - n_stored} of 16 rows are missing: the run"):
+        jl.open(path)
     with pytest.raises(ValueError, match=r"another problem, which differs in scene; nothing is overwritten"):
         jl.simulate_many(survey, stand(0.3), key=KEY, **FAST, path=path)
     reports = []
     waveforms = jl.simulate_many(survey, scene, key=KEY, **FAST, path=path, progress=reports.append)
     assert same(uninterrupted, waveforms)
-    assert (reports[0].done, reports[-1].done, reports[-1].total) == (2 * n_stored + 2, 16, 16)
+    assert (reports[0].done, reports[-1].done, reports[-1].total) == (n_stored + 2, 16, 16)
     assert reports[-1].left == 0.0
     assert str(reports[-1]).startswith("16 of 16 shots")
-    assert not (tmp_path / "many.nc.parts").exists()
-    # The file is there: nothing is traced.
+    # All is there: nothing is traced.
     assert same(waveforms, jl.simulate_many(survey, scene, key=KEY, **FAST, path=path, progress=pytest.fail))
     opened = jl.Waveforms.open(path)
     assert same(waveforms, opened)
@@ -391,11 +393,9 @@ def test_an_interrupted_run_continues(tmp_path):
 
 
 def test_one_run_at_a_time_writes_a_file(tmp_path):
-    path = tmp_path / "many.nc"
-    with contextlib.closing(sqlite3.connect(f"{path}.parts", isolation_level=None)) as connection:
-        connection.execute("BEGIN EXCLUSIVE")
-        with pytest.raises(OSError, match=r"many\.nc\.parts is in use by another run"):
-            jl.simulate_many(nadir(16), stand(), key=KEY, **FAST, path=path)
+    path = tmp_path / "many.zarr"
+    with filelock.FileLock(f"{path}.lock"), pytest.raises(OSError, match=r"many\.zarr is in use by another"):
+        jl.simulate_many(nadir(16), stand(), key=KEY, **FAST, path=path)
 
 
 # Another process runs this: it says that the first task is done, and waits.
@@ -419,15 +419,13 @@ jl.simulate_many(survey, scene, key=jax.random.key(5), path=sys.argv[1], progres
 @pytest.mark.parametrize("end", ["ends", "is killed"])
 def test_a_second_process_is_refused_until_the_first_has_gone(tmp_path, end):
     survey = jl.Survey(jl.Lidar(), [(float(x), 0.0) for x in range(16)])
-    scene, path = jl.Scene(ground=jl.Ground(slope=5.0)), tmp_path / "many.nc"
+    scene, path = jl.Scene(ground=jl.Ground(slope=5.0)), tmp_path / "many.zarr"
     process = subprocess.Popen(
         [sys.executable, "-c", BUSY_RUN, str(path)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
     )
     try:
         assert int(process.stdout.readline()) > 0
-        with pytest.raises(
-            OSError, match=r"many\.nc\.parts is in use by another run: wait until it has ended"
-        ):
+        with pytest.raises(OSError, match=r"many\.zarr is in use by another run: wait until it has ended"):
             jl.simulate_many(survey, scene, key=KEY, path=path)
         if end == "ends":
             process.communicate("\n" * 16)
@@ -440,51 +438,76 @@ def test_a_second_process_is_refused_until_the_first_has_gone(tmp_path, end):
     # Shots of the process that was killed are not traced again, nor any where it has ended.
     assert [report.done for report in reports] == ([] if end == "ends" else list(range(4, 17, 2)))
     assert same(waveforms, jl.simulate_many(survey, scene, key=KEY))
-    assert [p.name for p in tmp_path.iterdir()] == ["many.nc"]
 
 
-def test_a_run_that_has_ended_meanwhile_is_read(tmp_path, monkeypatch):
-    """Another run of the same problem ends after this one has looked for its file."""
-    from jaxlidar.survey import simulate_many
+def test_damaged_chunks_are_named_and_their_shots_traced_again(tmp_path):
+    survey, scene, path = nadir(16), stand(), tmp_path / "many.zarr"
 
-    survey, scene, path = NADIR, jl.Scene(ground=jl.Ground(slope=5.0)), tmp_path / "many.nc"
-    expected, open_checkpoint = jl.simulate_many(survey, scene, key=KEY), simulate_many.open_checkpoint
+    def run(**options):
+        return jl.simulate_many(survey, scene, key=KEY, **FAST, path=path, **options)
 
-    def end_the_other_run(*arguments):
-        monkeypatch.undo()
-        jl.simulate_many(survey, scene, key=KEY, path=path)
-        return open_checkpoint(*arguments)
-
-    monkeypatch.setattr(simulate_many, "open_checkpoint", end_the_other_run)
-    waveforms = jl.simulate_many(survey, scene, key=KEY, path=path, progress=pytest.fail)
-    assert same(waveforms, expected)
-    assert [p.name for p in tmp_path.iterdir()] == ["many.nc"]
-
-
-def test_damaged_files_are_refused_by_name(tmp_path):
-    survey, scene, path = nadir(16), stand(), tmp_path / "many.nc"
-
-    def stop(progress):
-        raise Stopped
-
-    with pytest.raises(Stopped):
-        jl.simulate_many(survey, scene, key=KEY, **FAST, path=path, progress=stop)
-    # A damaged task is named and traced again; a damaged file is refused.
-    number = min(stored_tasks(path))
-    with contextlib.closing(sqlite3.connect(f"{path}.parts", isolation_level=None)) as connection:
-        connection.execute("UPDATE entries SET content = substr(content, 1, 100) WHERE number = ?", (number,))
-    with pytest.warns(UserWarning, match=rf"many\.nc\.parts is damaged, and .* again: entry {number} "):
-        many = jl.simulate_many(survey, scene, key=KEY, **FAST, path=path)
+    info = run().info
+    flip_a_bit(path / "stderr" / "c" / "3" / "0" / "0")
+    (path / "photons" / "c" / "0").unlink()
+    with pytest.raises(ValueError, match=r"many\.zarr: /photons: damaged \(1 chunks are missing\)"):
+        jl.open(path)
+    reports = []
+    with pytest.warns(
+        UserWarning, match=r"many\.zarr is damaged, .* again: chunk 0 of photons, chunk 3 of st"
+    ):
+        many = run(progress=reports.append)
+    assert [report.done for report in reports] == [14, 16]
     assert same(many, jl.simulate_many(survey, scene, key=KEY, **FAST))
-    path.unlink()
-    (tmp_path / "many.nc.parts").write_bytes(b"no checkpoint")
-    with pytest.raises(ValueError, match=r"many\.nc\.parts is damaged or no checkpoint"):
-        jl.simulate_many(survey, scene, key=KEY, **FAST, path=path)
-    path.write_bytes(b"no netCDF")
-    with pytest.raises(ValueError, match=r"many.nc: byte 0: no netCDF-4 file"):
-        jl.simulate_many(survey, scene, key=KEY, **FAST, path=path)
-    with pytest.raises(FileNotFoundError, match=r"none.nc: no such file"):
-        jl.Waveforms.open(tmp_path / "none.nc")
+    # It states the time of the first run.
+    assert many.info == info
+    assert same(many, run(progress=pytest.fail))
+
+
+def test_damage_of_what_describes_all_shots_is_repaired(tmp_path):
+    scene, path = jl.Scene(ground=jl.Ground(slope=5.0)), tmp_path / "many.zarr"
+    expected = jl.simulate_many(NADIR, scene, key=KEY, truth=True)
+    jl.simulate_many(NADIR, scene, key=KEY, truth=True, path=path)
+    flip_a_bit(path / "time" / "c" / "0")
+    (path / "truth" / "material" / "c" / "0").unlink()
+    (path / "acquisition" / "gps_time" / "c" / "0").unlink()
+    with pytest.raises(ValueError, match=r"many\.zarr: .*damaged"):
+        jl.open(path)
+    names = r"acquisition/gps_time, time, truth/material$"
+    with pytest.warns(UserWarning, match=rf"many\.zarr is damaged, and these arrays are made again: {names}"):
+        many = jl.simulate_many(NADIR, scene, key=KEY, truth=True, path=path)
+    assert same(many, expected)
+
+
+def test_a_full_disk_stops_a_run_which_goes_on_with_what_was_written(tmp_path, monkeypatch):
+    survey, scene, path = nadir(16), stand(), tmp_path / "many.zarr"
+    write, writes = StoredRows.write, []
+
+    def write_until_the_disk_is_full(self, shots, values):
+        writes.append(shots)
+        if len(writes) > 5:
+            raise OSError(errno.ENOSPC, "no space left on device")
+        write(self, shots, values)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(StoredRows, "write", write_until_the_disk_is_full)
+        with pytest.raises(OSError, match="no space left on device"):
+            jl.simulate_many(survey, scene, key=KEY, **FAST, path=path)
+    assert len(stored_shots(path)) == 10
+    many = jl.simulate_many(survey, scene, key=KEY, **FAST, path=path)
+    assert same(many, jl.simulate_many(survey, scene, key=KEY, **FAST))
+
+
+def test_paths_that_are_no_store_are_refused_before_any_work(tmp_path):
+    survey, scene = nadir(16), stand()
+    with pytest.raises(
+        ValueError, match=r"path = .*many\.nc; admissible is .* such as many\.zarr.* method save"
+    ):
+        jl.simulate_many(survey, scene, key=KEY, **FAST, path=tmp_path / "many.nc")
+    (tmp_path / "many.zarr").write_text("no store")
+    with pytest.raises(ValueError, match=r"many\.zarr: it is there already and no Zarr store"):
+        jl.simulate_many(survey, scene, key=KEY, **FAST, path=tmp_path / "many.zarr")
+    with pytest.raises(FileNotFoundError, match=r"none\.zarr: no such folder"):
+        jl.Waveforms.open(tmp_path / "none.zarr")
 
 
 def test_a_dataset_has_units_and_all_waveforms():
@@ -588,8 +611,8 @@ def test_an_interrupt_says_where_finished_shots_are(tmp_path, monkeypatch):
     survey = jl.Survey(jl.Lidar(), position=[(0, 0), (10, 0)])
     scene = jl.Scene(ground=jl.Ground())
     with pytest.raises(KeyboardInterrupt) as interrupt:
-        jl.simulate_many(survey, scene, key=jax.random.key(0), path=tmp_path / "a.nc")
-    assert "a.nc.parts: the same call continues" in interrupt.value.__notes__[0]
+        jl.simulate_many(survey, scene, key=jax.random.key(0), path=tmp_path / "a.zarr")
+    assert "a.zarr: the same call continues" in interrupt.value.__notes__[0]
 
 
 def test_a_tree_on_a_lawn_is_not_cut_off():

@@ -1,4 +1,4 @@
-"""Fingerprints of checkpoints: a file goes on with its own problem only, and what differs is named."""
+"""Fingerprints of stores: a run goes on with its own problem only, and what differs is named."""
 
 import dataclasses
 import importlib
@@ -84,17 +84,17 @@ def starts_work(**problem):
 
 
 @pytest.fixture(scope="module")
-def empty_checkpoint(tmp_path_factory):
-    """A file of the problem, without fits."""
-    path = tmp_path_factory.mktemp("checkpoint") / "fits.sqlite"
+def empty_store(tmp_path_factory):
+    """A store of the problem, without fits."""
+    path = tmp_path_factory.mktemp("store") / "fits.zarr"
     assert starts_work(**PROBLEM, path=path)
     return path
 
 
 @pytest.fixture
-def resumes(empty_checkpoint, tmp_path):
-    """A function that runs the problem, with some arguments changed, with a copy of the file."""
-    path = shutil.copy(empty_checkpoint, tmp_path)
+def resumes(empty_store, tmp_path):
+    """A function that runs the problem, with some arguments changed, with a copy of the store."""
+    path = shutil.copytree(empty_store, tmp_path / "fits.zarr")
     return lambda **changes: starts_work(**PROBLEM | {"path": path} | changes)
 
 
@@ -165,10 +165,10 @@ CHANGES = [
 
 @pytest.mark.parametrize(("named_part", "change"), CHANGES)
 def test_another_problem_is_refused_and_what_differs_is_named(resumes, tmp_path, named_part, change):
-    before = (tmp_path / "fits.sqlite").read_bytes()
-    with pytest.raises(ValueError, match=rf"fits\.sqlite holds results of another .* in .*\b{named_part}"):
+    before = (tmp_path / "fits.zarr" / "zarr.json").read_bytes()
+    with pytest.raises(ValueError, match=rf"fits\.zarr holds results of another .* in .*\b{named_part}"):
         resumes(**change)
-    assert (tmp_path / "fits.sqlite").read_bytes() == before
+    assert (tmp_path / "fits.zarr" / "zarr.json").read_bytes() == before
 
 
 def test_only_what_differs_is_named(resumes):
@@ -177,7 +177,7 @@ def test_only_what_differs_is_named(resumes):
 
 
 def test_the_kind_of_prior_and_the_scale_count(resumes, tmp_path):
-    path = tmp_path / "prior.sqlite"
+    path = tmp_path / "prior.zarr"
     normal = {"bounds": (0.0, 2.0), "start": 1.0, "prior": (1.0, 0.5)}
     assert resumes(path=path, scale=(0.5, 2.0), **height(**normal))
     with pytest.raises(ValueError, match=r"which differs in prior of 'height'; "):
@@ -187,7 +187,7 @@ def test_the_kind_of_prior_and_the_scale_count(resumes, tmp_path):
 
 
 def test_coefficients_of_leaves_count(resumes, tmp_path):
-    path, table = tmp_path / "leaf.sqlite", shipped("PC")
+    path, table = tmp_path / "leaf.zarr", shipped("PC")
 
     def leaf(factor):
         absorption = table.absorption * np.where(np.arange(len(table.wavelength)) == 700, factor, 1.0)
@@ -201,7 +201,7 @@ def test_coefficients_of_leaves_count(resumes, tmp_path):
 
 
 def test_functions_are_identified_by_code_closures_and_globals(resumes, tmp_path, monkeypatch):
-    path = tmp_path / "closure.sqlite"
+    path = tmp_path / "closure.zarr"
     assert resumes(path=path, unknowns=unknowns(apply=brightness_setter(2.0)))
     assert resumes(path=path, unknowns=unknowns(apply=brightness_setter(2.0)))
     with pytest.raises(ValueError, match=r"which differs in where or apply of 'brightness'; "):

@@ -399,14 +399,14 @@ def test_a_profile_from_two_wavelengths(precision, tmp_path):
     assert np.all(kernel.resolution > THICK)
     assert np.all(fit.band("plants", robust=True)[1] >= high - 1e-6)
 
-    path = tmp_path / "fits.sqlite"
+    path = tmp_path / "fits.zarr"
     fits = inversion.retrieve_many(observed, lidar, start, unknowns, lanes=3, path=path, **options)
     np.testing.assert_allclose(fits.values["plants"][0], fit.values["plants"], atol=2e-2)
     assert fits.strength["plants"].shape == (3,)
     assert fits.band("plants")[0].shape == fits.averaging_kernel("plants").resolution.shape == (3, 6)
-    from_checkpoint = inversion.retrieve_many(observed, lidar, start, unknowns, lanes=3, path=path, **options)
-    np.testing.assert_array_equal(from_checkpoint.averaging, fits.averaging)
-    np.testing.assert_array_equal(from_checkpoint.strength["plants"], fits.strength["plants"])
+    from_store = inversion.retrieve_many(observed, lidar, start, unknowns, lanes=3, path=path, **options)
+    np.testing.assert_array_equal(from_store.averaging, fits.averaging)
+    np.testing.assert_array_equal(from_store.strength["plants"], fits.strength["plants"])
     with_other_prior = [*unknowns[:2], profile_of(6, Smooth(5.0, spacing=THICK))]
     with pytest.raises(ValueError, match="which differs in prior of 'plants'"):
         inversion.retrieve_many(observed, lidar, start, with_other_prior, lanes=3, path=path, **options)

@@ -68,13 +68,13 @@ def test_workers_give_the_same_fits(footprints, options):
 
 @pytest.mark.slow
 def test_a_worker_that_dies_costs_its_fits_a_second_try(footprints, tmp_path):
-    expected, path = fit(footprints, lanes=2), tmp_path / "fits.sqlite"
+    expected, path = fit(footprints, lanes=2), tmp_path / "fits.zarr"
     dying = Dying([1])
     assert np.array_equal(fit(footprints, lanes=2, executor=dying).fitted, expected.fitted)
     assert dying.submitted.count(1) == 2
     with pytest.raises(RuntimeError, match="the workers of chunk 1 died twice"):
         fit(footprints, lanes=2, executor=Dying([1, 1]), path=path)
-    # The checkpoint has the fits of the other chunks.
+    # The store has the fits of the other chunks.
     reports = []
     resumed = fit(footprints, lanes=2, path=path, progress=reports.append)
     assert np.array_equal(resumed.fitted, expected.fitted)
@@ -141,8 +141,8 @@ def test_each_footprint_may_have_its_own_pulse_and_start(footprints):
         fit(footprints, scene=unequal)
 
 
-def test_an_interrupted_run_goes_on_from_its_checkpoint(footprints, tmp_path):
-    path = tmp_path / "fits.sqlite"
+def test_an_interrupted_run_goes_on_from_its_store(footprints, tmp_path):
+    path = tmp_path / "fits.zarr"
     expected = fit(footprints)
 
     def stop(progress):
@@ -156,7 +156,7 @@ def test_an_interrupted_run_goes_on_from_its_checkpoint(footprints, tmp_path):
     assert [p.done for p in reports] == list(range(10, COUNT + 1))
     assert np.array_equal(resumed.values["height"], expected.values["height"])
     assert resumed.status == expected.status
-    # No fit is left, and the file takes no other problem.
+    # No fit is left, and the store takes no other problem.
     assert np.array_equal(fit(footprints, path=path, progress=stop).covariance, expected.covariance)
     observed, noise, time = footprints
     with pytest.raises(ValueError, match="holds results of another problem, which differs in observed"):

@@ -84,7 +84,7 @@ def unusable_shots():
 
 def test_shots_without_a_fit_have_columns_of_nan_and_the_reason(tmp_path):
     plain = inversion.gedi_table(unusable_shots())
-    table = inversion.gedi_table(unusable_shots(), fit=True, path=tmp_path / "fits")
+    table = inversion.gedi_table(unusable_shots(), fit=True, path=tmp_path / "fits.zarr")
     assert list(table)[: len(plain.columns)] == list(plain)
     assert list(table)[len(plain.columns) :] == [*names_of_fit(), "fit_quality", "fit_reasons"]
     for name in names_of_fit():
@@ -97,7 +97,7 @@ def test_shots_without_a_fit_have_columns_of_nan_and_the_reason(tmp_path):
     assert "fits" in table.attributes["title"]
     assert not any(name.startswith("fit_") for name in (*plain, *plain.attributes))
     # Nothing to fit, nothing to continue with.
-    assert not (tmp_path / "fits").exists()
+    assert not (tmp_path / "fits.zarr").exists()
 
 
 def test_a_shot_that_cannot_be_prepared_is_bad():
@@ -117,25 +117,25 @@ def test_the_command_stores_fits_until_the_table_is_written(tmp_path, monkeypatc
 
     record, out = tmp_path / "shots.h5", tmp_path / "shots.csv"
     record.touch()
-    checkpoints = []
+    stores = []
 
     def interrupted_once(files, *, path, fit, **options):
-        checkpoints.append(path)
+        stores.append(path)
         assert fit
-        path.touch()
-        if len(checkpoints) == 1:
+        path.mkdir(exist_ok=True)
+        if len(stores) == 1:
             raise KeyboardInterrupt
         return inversion.gedi_table(unusable_shots(), fit=True, path=None, **options)
 
     monkeypatch.setattr("inversion.commands.gedi_table", interrupted_once)
     arguments = [str(record), "-o", str(out), "--fit"]
     assert gedi.main(arguments, standalone_mode=False) == INTERRUPTED
-    assert str(checkpoints[0]) in capsys.readouterr().err
-    assert checkpoints[0].exists()
+    assert str(stores[0]) in capsys.readouterr().err
+    assert stores[0].exists()
     assert not out.exists()
     assert gedi.main(arguments, standalone_mode=False) == 0
-    assert checkpoints[1] == checkpoints[0]
-    assert not checkpoints[0].exists()
+    assert stores[1] == stores[0]
+    assert not stores[0].exists()
     assert "fit_ground" in out.read_text().splitlines()[0]
 
 
@@ -144,11 +144,11 @@ def test_the_command_stores_fits_until_the_table_is_written(tmp_path, monkeypatc
 
 @pytest.mark.slow
 def test_fits_of_a_made_up_canopy(tmp_path):
-    """Two shots of which one is damaged; the second time the fits come from the checkpoint."""
+    """Two shots of which one is damaged; the second time the fits come from the store."""
     random = np.random.default_rng(0)
     shots = [shot(1, random=random), *unusable_shots(), shot(4, random=random, degrade=1)]
     stages = []
-    table = inversion.gedi_table(shots, fit=True, path=tmp_path / "fits", progress=stages.append)
+    table = inversion.gedi_table(shots, fit=True, path=tmp_path / "fits.zarr", progress=stages.append)
     assert [(p.done, p.total) for p in stages if p.unit == "fits"] == [(1, 2), (2, 2)]
     assert str(stages[0]).startswith("2 of 2 shots, ")
     assert str(stages[-1]).startswith("2 of 2 fits, ")
@@ -167,7 +167,9 @@ def test_fits_of_a_made_up_canopy(tmp_path):
     area = depth * table["fit_plant_area_density"].mean(axis=1)
     np.testing.assert_allclose(table["fit_pai"], area, rtol=1e-9)
     repeated_stages = []
-    repeated = inversion.gedi_table(shots, fit=True, path=tmp_path / "fits", progress=repeated_stages.append)
+    repeated = inversion.gedi_table(
+        shots, fit=True, path=tmp_path / "fits.zarr", progress=repeated_stages.append
+    )
     assert all(p.unit == "shots" for p in repeated_stages)
     for name in names_of_fit():
         np.testing.assert_array_equal(repeated[name], table[name])

@@ -143,7 +143,8 @@ def test_shots_of_any_length_share_programs_and_one_bad_shot_does_no_harm():
         ({"shots": [], "projection": 0.0}, ValueError, "projection = 0"),
         ({"shots": [], "fit": "yes"}, TypeError, "fit"),
         ({"shots": [], "fit": True, "path": 3}, TypeError, "path"),
-        ({"shots": [], "path": "fits.sqlite"}, ValueError, "fits.sqlite.*fit=True"),
+        ({"shots": [], "path": "fits.zarr"}, ValueError, "fits.zarr.*fit=True"),
+        ({"shots": [], "path": "fits.sqlite", "fit": True}, ValueError, "admissible is .* fits.zarr"),
     ],
 )
 def test_inadmissible_arguments_are_refused(arguments, error, message):

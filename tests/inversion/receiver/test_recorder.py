@@ -223,9 +223,9 @@ def test_one_fit_is_that_of_a_batch(interleaved):
 
 
 @pytest.mark.slow
-def test_checkpoints_refuse_another_recorder(interleaved, tmp_path):
+def test_stores_refuse_another_recorder(interleaved, tmp_path):
     records, pulse, *_ = interleaved
-    path = tmp_path / "fits.sqlite"
+    path = tmp_path / "fits.zarr"
     recorder = Recorder(offset=(-1.0, 1.0))
     first = fits_of(records[:2], [pulse], 0.01, recorder, path=path)
     repeated = fits_of(records[:2], [pulse], 0.01, recorder, path=path)

@@ -1,4 +1,4 @@
-"""Retrieval of one scene from many records: Jacobians, priors, stopping, errors, checkpoints."""
+"""Retrieval of one scene from many records: Jacobians, priors, stopping, errors, stores."""
 
 import dataclasses
 from types import SimpleNamespace
@@ -286,7 +286,7 @@ def test_markov_fields_and_smooth_priors_are_refused_where_they_do_not_serve():
         inversion.MarkovField(0.0)
 
 
-# -- stopping, groups, errors and checkpoints, without a canopy --------------------------------------------
+# -- stopping, groups, errors and stores, without a canopy ------------------------------------------------
 
 
 def test_the_stopping_rule_waits_for_ten_steps_without_a_gain():
@@ -443,7 +443,7 @@ def test_a_value_at_its_bound_has_no_averaging_kernel():
 @pytest.mark.slow
 def test_an_interrupted_run_goes_on_and_another_problem_is_refused(tmp_path):
     survey, waves, _, groups = flat_case()
-    path = tmp_path / "fit.sqlite"
+    path = tmp_path / "fit.zarr"
     shared = {"noise": 1e-3, "time": waves.time, "max_orders": 1, "draws": 3, "held_out": 0.0}
     shared |= {"gain": (0.3, 3.0), "groups": groups}
     records = np.asarray(waves.reflectance)
