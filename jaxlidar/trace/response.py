@@ -69,15 +69,15 @@ class Response(eqx.Module):
     (1, 1) 1.000
     """
 
-    first: Float[Array, "traces materials first_histories bins"]
-    higher: Float[Array, "traces materials histories bins"] | None
-    first_outside: Float[Array, "traces materials first_histories"]
-    higher_outside: Float[Array, "traces materials histories"] | None
-    arrived: Float[Array, "traces materials histories"]
-    departed: Float[Array, "traces materials histories"]
-    escaped: Float[Array, "traces histories"]
-    late: Float[Array, "traces histories"]
-    remaining: Float[Array, "traces histories"]
+    first: Float[Array, "*shots traces materials first_histories bins"]
+    higher: Float[Array, "*shots traces materials histories bins"] | None
+    first_outside: Float[Array, "*shots traces materials first_histories"]
+    higher_outside: Float[Array, "*shots traces materials histories"] | None
+    arrived: Float[Array, "*shots traces materials histories"]
+    departed: Float[Array, "*shots traces materials histories"]
+    escaped: Float[Array, "*shots traces histories"]
+    late: Float[Array, "*shots traces histories"]
+    remaining: Float[Array, "*shots traces histories"]
 
 
 @with_automatic_axes
