@@ -62,17 +62,23 @@ _RIDGE = 1e-13
 
 
 class FitInputs(NamedTuple):
-    """Arguments of `retrieve` that JAX may be tracing. Of times and keys there are no derivatives.
+    """Numbers of a `Problem`, and of a key, that JAX may be tracing. Of the last two are no derivatives.
 
     `key_data`: of the random key, which programs cannot hand to the host as it is.
     """
 
     observed: Any
     noise: Any
-    time: Any
     lidar: Any
     scene: Any
+    time: Any
     key_data: Any
+
+    @staticmethod
+    def of(problem: Any, key: PRNGKeyArray) -> "FitInputs":
+        """Return those of a `Problem` and a key."""
+        numbers = (problem.observed, problem.noise, problem.lidar, problem.scene, problem.time)
+        return FitInputs(*numbers, jax.random.key_data(key))
 
     @property
     def is_traced(self) -> bool:

@@ -46,7 +46,8 @@ same code serves a single fit and many fits whose simulations run in one compile
 """
 
 import dataclasses
-from collections.abc import Callable, Generator, Sequence
+import itertools
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -57,12 +58,7 @@ import optimistix as optx
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 from scipy import linalg, optimize
 
-from inversion.fit.data import (
-    ObservedWaveform,
-    SampleNoise,
-    neighbour_correlation,
-    shared_errors_of_samples,
-)
+from inversion.fit.data import ObservedWaveform, SampleNoise
 from inversion.fit.fit_summary import CompletedFit, FitDetails, FitSummary, Step
 from inversion.fit.model import Evaluation, batch_stderr
 from inversion.fit.prior_residuals import PriorResiduals
@@ -142,14 +138,35 @@ class EvaluationRequest(NamedTuple):
 FitGenerator = Generator[EvaluationRequest, Evaluation, CompletedFit]
 
 
-def run_fit(fit: FitGenerator, simulate: Callable[[EvaluationRequest], Evaluation]) -> CompletedFit:
-    """Run one fit to its end."""
-    try:
-        request = next(fit)
-        while True:
-            request = fit.send(simulate(request))
-    except StopIteration as end:
-        return end.value
+def run_fits(
+    fits: Iterator[tuple[int, FitGenerator]],
+    simulate: Callable[[Mapping[int, EvaluationRequest]], Mapping[int, Evaluation]],
+    n_together: int,
+) -> Iterator[tuple[int, CompletedFit]]:
+    """Run numbered fits in lockstep. Yield each with its number as it ends.
+
+    **Arguments:**
+
+    - `simulate`: evaluates the requests of all running fits, by their numbers.
+    - `n_together`: most fits that run at a time.
+    """
+    # The fits that run at present, with the request that each waits for.
+    running: dict[int, tuple[FitGenerator, EvaluationRequest]] = {}
+    while True:
+        # A fit that has ended makes room at once: in groups of fits that begin and end together, most members
+        # would be idle until the slowest fit has ended.
+        for number, fit in itertools.islice(fits, n_together - len(running)):
+            running[number] = fit, next(fit)
+        if not running:
+            return
+        for number, evaluation in simulate({n: request for n, (_, request) in running.items()}).items():
+            fit, _ = running[number]
+            try:
+                # The fit goes on to its next request, or ends.
+                running[number] = fit, fit.send(evaluation)
+            except StopIteration as end:
+                del running[number]
+                yield number, end.value
 
 
 # -- Gauss-Newton steps of optimistix
@@ -291,8 +308,8 @@ class LeastSquaresFit:
         self.n_scene = self.low.size - recorder_model.count
         self.start = flat_start(self.unknowns) if start is None else start
         self.prior = PriorResiduals(self.unknowns)
-        self.correlation = neighbour_correlation(float(recorder_model.recorder.correlation), self.is_fitted)
-        self.noise = SampleNoise(observed.sigma[self.is_fitted], None, self.correlation)
+        # That of simulation and pulse is added at the first iterate.
+        self.noise = SampleNoise(observed.sigma[self.is_fitted])
         # A single simulation has to be one with all batches.
         self.use_pilot = settings.max_steps > 1
         self.n_simulations, self.history = 0, []
@@ -320,17 +337,9 @@ class LeastSquaresFit:
 
     def update_weights(self, iterate: Iterate) -> float:
         """Renew the noise of simulation and pulse at an iterate. **Returns:** the mean relative change."""
-        batches = iterate.evaluation.batches
-        received = None if batches is None else self.recorder_model.received(batches, iterate.recorder_values)
-        simulation_sigma = np.broadcast_to(batch_stderr(received), self.is_fitted.shape)[self.is_fitted]
-        pulse_errors = self.recorder_model.pulse_noise(
-            iterate.evaluation.reflectance, iterate.recorder_values
-        )
         previous_sigma = self.noise.sigma
-        self.noise = SampleNoise(
-            np.hypot(self.observed.sigma[self.is_fitted], simulation_sigma),
-            shared_errors_of_samples(pulse_errors, self.is_fitted),
-            self.correlation,
+        self.noise = self.recorder_model.sample_noise(
+            self.observed, iterate.evaluation, iterate.recorder_values
         )
         return float(np.mean(np.abs(self.noise.sigma / previous_sigma - 1.0)))
 

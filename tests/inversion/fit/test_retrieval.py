@@ -18,7 +18,7 @@ from inversion.fit.solver import latin_hypercube
 from inversion.fit.uncertainty import estimate_covariance
 from inversion.fit.unknowns import bind_unknowns, optical_arrays
 from jaxlidar.planning.plan import MIN_BATCHES
-from tests.helpers import BY_PRECISION
+from tests.helpers import BY_PRECISION, ask
 
 LIDAR = jl.Lidar(
     wavelength=(532.0, 1064.0, 1550.0), altitude=500.0, divergence=8.0, pulse=jl.GaussianPulse(fwhm=4.0)
@@ -72,7 +72,7 @@ def retrieve_canopy(target, seed, start, unknowns=UNKNOWNS, **options):
     wave, noise = target
     observed = wave.reflectance + noise * np.random.default_rng(seed).normal(size=noise.shape)
     options = {"max_orders": 2, "n_photons": 8192, "n_rays": 2048, "key": jax.random.key(1), **options}
-    return inversion.retrieve(observed, LIDAR, start, unknowns, noise=noise, time=wave.time, **options)
+    return ask(inversion.retrieve, observed, LIDAR, start, unknowns, noise=noise, time=wave.time, **options)
 
 
 def assert_recovered(fit, truth, max_z=4.0):
@@ -223,7 +223,9 @@ def ground_wave(**scene):
 def retrieve_ground(observed=None, unknowns=GROUND, noise=1e-3, scene=None, lidar=PLAIN, **options):
     observed = ground_wave() if observed is None else observed
     scene = ground_scene(-0.2, (0.3, 0.3)) if scene is None else scene
-    return inversion.retrieve(observed, lidar, scene, unknowns, noise=noise, key=jax.random.key(0), **options)
+    return ask(
+        inversion.retrieve, observed, lidar, scene, unknowns, noise=noise, key=jax.random.key(0), **options
+    )
 
 
 @pytest.mark.slow
@@ -364,9 +366,15 @@ def test_starts_and_photons_have_different_keys(monkeypatch):
     unknown = Unknown(lambda s: s.ground.height, bounds=(-2.0, 2.0), name="height")
     key = jax.random.key(1)
     options = {"noise": 0.01, "key": key, "starts": 2, "max_steps": 1}
-    inversion.retrieve(wave, PLAIN, ground_scene(), [unknown], **options)
-    inversion.retrieve_many(
-        np.stack([wave.reflectance] * 2), PLAIN, ground_scene(), [unknown], time=wave.time, **options
+    ask(inversion.retrieve, wave, PLAIN, ground_scene(), [unknown], **options)
+    ask(
+        inversion.retrieve_many,
+        np.stack([wave.reflectance] * 2),
+        PLAIN,
+        ground_scene(),
+        [unknown],
+        time=wave.time,
+        **options,
     )
     assert len(keys) == 3
     batches = [jax.random.fold_in(key, n) for n in range(MIN_BATCHES)]
@@ -532,7 +540,15 @@ def test_relief_is_found_from_terrain_that_is_flat_at_the_start():
     lidar = jl.Lidar(altitude=1000.0, divergence=8.0, pulse=jl.GaussianPulse(4.0))
     wave = jl.simulate(lidar, scene(1.5), key=key, window=(-60.0, 60.0))
     depth = Unknown(apply=lambda s, d: scene(d), bounds=(-3.0, 3.0), start=0.0, name="depth")
-    fit = inversion.retrieve(
-        wave.reflectance, lidar, scene(0.0), [depth], noise=1e-4, time=wave.time, key=key, max_orders=1
+    fit = ask(
+        inversion.retrieve,
+        wave.reflectance,
+        lidar,
+        scene(0.0),
+        [depth],
+        noise=1e-4,
+        time=wave.time,
+        key=key,
+        max_orders=1,
     )
     assert float(fit.values["depth"]) == pytest.approx(1.5, abs=0.02)
