@@ -29,7 +29,6 @@ import equinox as eqx
 import jax.numpy as jnp
 import jax.scipy.special
 import numpy as np
-import optimistix as optx
 from jaxtyping import Array, ArrayLike, Float, PRNGKeyArray
 
 from inversion.fit.fit_summary import CompletedFit
@@ -37,7 +36,6 @@ from inversion.fit.model import ForwardModel
 from inversion.fit.prior_residuals import fixed_priors
 from inversion.fit.problem import Problem, check_problem
 from inversion.fit.retrieval import check_progress, fit_record, solver_settings
-from inversion.fit.solver import DEFAULT_SOLVER
 from inversion.fit.uncertainty import correlation_of, estimate_covariance
 from inversion.fit.unknowns import (
     BoundUnknown,
@@ -236,7 +234,6 @@ def profile_likelihood(
     values: ArrayLike | Sequence,
     *,
     key: PRNGKeyArray,
-    solver: optx.AbstractLeastSquaresSolver = DEFAULT_SOLVER,
     max_steps: float = 50,
     starts: float = 1,
     progress: Callable[[int], None] | None = None,
@@ -253,7 +250,7 @@ def profile_likelihood(
     - `name`: name of the unknown that is fixed; it must be a single number. Its value is put into the scene
       before the others.
     - `values`: (points,) values of that unknown, two or more, increasing, within its bounds.
-    - `key`, `solver`, `max_steps`, `starts`: as for `retrieve`.
+    - `key`, `max_steps`, `starts`: as for `retrieve`.
     - `progress`: called with the index of each value when its fit has ended.
 
     **Returns:** a `Profile`.
@@ -277,7 +274,7 @@ def profile_likelihood(
     check_problem(problem)
     check_progress(progress)
     check_key(key)
-    settings, bound = solver_settings(solver, max_steps, starts), problem.bound
+    settings, bound = solver_settings(max_steps, starts), problem.bound
     lidar, scene, unknowns = bound.lidars[0], bound.scenes[0], bound.unknowns[0]
     priors = fixed_priors(unknowns)
     fixed = _fixed_unknown(name, unknowns)

@@ -45,13 +45,14 @@ from jax.core import Tracer
 from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Float, PRNGKeyArray
 
+from inversion.fit.bounded_gauss_newton import held_by_bounds
 from inversion.fit.data import ObservedWaveform, with_fixed_window
 from inversion.fit.fit_summary import CompletedFit
 from inversion.fit.model import SimulationInputs, Values, batch_keys
 from inversion.fit.prior_residuals import PriorResiduals
 from inversion.fit.recorder_model import RecorderModel
 from inversion.fit.result import Retrieval
-from inversion.fit.solver import fit_range, held_by_bounds
+from inversion.fit.solver import fit_range
 from inversion.fit.unknowns import BoundUnknown, Setter, flat_bounds, set_values, split_values
 from jaxlidar import Plan, Waveform, total_reflectance, trace_scene
 from jaxlidar.extend import side_by_side, tensordot

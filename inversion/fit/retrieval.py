@@ -1,12 +1,11 @@
 """Retrieval of scene properties from one record."""
 
 import dataclasses
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import optimistix as optx
 from jax.core import Tracer
 from jaxtyping import PRNGKeyArray
 
@@ -26,7 +25,6 @@ from inversion.fit.problem import BoundProblem, Problem, check_problem, scale_un
 from inversion.fit.recorder_model import RecorderModel, recorder_unknowns
 from inversion.fit.result import Retrieval, retrieval_of
 from inversion.fit.solver import (
-    DEFAULT_SOLVER,
     EvaluationRequest,
     SolverSettings,
     fits_from_starts,
@@ -34,7 +32,7 @@ from inversion.fit.solver import (
     multistart,
     run_fits,
 )
-from inversion.fit.unknowns import BoundUnknown, bind_unknowns, smooth_names
+from inversion.fit.unknowns import bind_unknowns, smooth_names
 from inversion.receiver.recorder import Recorder
 from jaxlidar import Lidar, Scene, Waveform, trace_scene, waveform_of
 from jaxlidar.extend import check_integer, check_key, check_kinds
@@ -47,7 +45,6 @@ def retrieve(
     problem: Problem,
     *,
     key: PRNGKeyArray,
-    solver: optx.AbstractLeastSquaresSolver = DEFAULT_SOLVER,
     max_steps: float = 50,
     starts: float = 1,
     progress: Callable[[Step], None] | None = None,
@@ -81,10 +78,6 @@ def retrieve(
 
     - `problem`: a `Problem` of one record.
     - `key`: a JAX random key, other than that of a simulated record.
-    - `solver`: a Gauss-Newton method of optimistix. A step that leaves the bounds is replaced by the minimum
-      of the linearised problem within them. Default: Levenberg-Marquardt. A fit also ends if a Gauss-Newton
-      step within the bounds would be below 0.05 standard errors, or if small steps no longer improve it. With
-      a `Smooth` prior, only the default is admissible: all steps are then solved within the bounds.
     - `max_steps`: most simulations, each with its Jacobian, from each start; no more than half of them are
       with few photons. Default 50.
     - `starts`: number of starting points; the best fit is returned. The first is that of the unknowns
@@ -116,7 +109,7 @@ def retrieve(
     check_problem(problem)
     check_key(key)
     check_progress(progress)
-    settings = solver_settings(solver, max_steps, starts)
+    settings = solver_settings(max_steps, starts)
     inputs = FitInputs.of(problem, key)
     if not inputs.is_traced:
         fitted = fit_record(problem.bound, settings, key, progress=progress, throw=throw)
@@ -159,7 +152,6 @@ def fit_record(
     throw: bool = False,
 ) -> FittedRecord:
     """Fit the record of a problem. **Raises:** RuntimeError with `throw`, if the fit does not converge."""
-    check_solver_for(problem.unknowns[0], settings)
     model = ForwardModel(problem.lidars[0], problem.scenes[0], problem.plan, problem.unknowns[0], key)
     recorder = problem.recorder_model(0)
     fits = fits_from_starts(
@@ -251,22 +243,9 @@ def retrieval_of_record(problem: BoundProblem, fitted: FittedRecord) -> Retrieva
     return retrieval_of(fit, problem.all_unknowns, model.scene_at(scene_values), waveform)
 
 
-def solver_settings(solver: Any, max_steps: float, starts: float) -> SolverSettings:
-    """Check the solver and its numbers. **Raises:** ValueError for inadmissible ones."""
-    if not isinstance(solver, optx.AbstractGaussNewton):
-        raise ValueError(f"solver = {solver!r} is no Gauss-Newton method of optimistix")
-    return SolverSettings(solver, check_integer("max_steps", max_steps), check_integer("starts", starts))
-
-
-def check_solver_for(unknowns: Sequence[BoundUnknown], settings: SolverSettings) -> None:
-    """Refuse other solvers for profiles, whose steps are solved within the bounds. **Raises:** ValueError."""
-    # The bounded Gauss-Newton method takes no settings of a solver.
-    names = [unknown.name for unknown in unknowns if unknown.smooth is not None]
-    if names and settings.solver != DEFAULT_SOLVER:
-        raise ValueError(
-            f"solver = {settings.solver!r}, but unknown {names[0]!r} has a Smooth prior; admissible with one "
-            "is the default"
-        )
+def solver_settings(max_steps: float, starts: float) -> SolverSettings:
+    """Check the numbers of a fit. **Raises:** ValueError for inadmissible ones."""
+    return SolverSettings(check_integer("max_steps", max_steps), check_integer("starts", starts))
 
 
 def check_progress(progress: object) -> None:

@@ -24,7 +24,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optimistix as optx
 from jaxtyping import Array, PRNGKeyArray
 
 from inversion.fit.fit_summary import FitSummary, SummarySizes
@@ -32,9 +31,8 @@ from inversion.fit.model import Evaluation, ForwardModel, SimulationInputs, eval
 from inversion.fit.planning import trace_sizes
 from inversion.fit.problem import BoundProblem, Problem, check_problem
 from inversion.fit.result import Retrievals, retrievals_of
-from inversion.fit.retrieval import check_progress, check_solver_for, solver_settings
+from inversion.fit.retrieval import check_progress, solver_settings
 from inversion.fit.solver import (
-    DEFAULT_SOLVER,
     EvaluationRequest,
     FitGenerator,
     SolverSettings,
@@ -91,7 +89,6 @@ def retrieve_many(
     problem: Problem,
     *,
     key: PRNGKeyArray,
-    solver: optx.AbstractLeastSquaresSolver = DEFAULT_SOLVER,
     max_steps: float = 50,
     starts: float = 1,
     lanes: int = 16,
@@ -107,7 +104,7 @@ def retrieve_many(
     **Arguments:**
 
     - `problem`: a `Problem` of many records.
-    - `key`, `solver`, `max_steps`, `starts`: as for `retrieve`.
+    - `key`, `max_steps`, `starts`: as for `retrieve`.
     - `lanes`: number of records simulated together (batch size), at least 1; memory grows with it. Default
       16.
     - `path`: a checkpoint, an SQLite file that stores every fit once it has ended, so that a run that was
@@ -147,9 +144,8 @@ def retrieve_many(
     check_kind("path", path, str | os.PathLike | None, "a path, or None")
     check_kind("executor", executor, Executor | None, "a concurrent.futures.Executor, or None")
     lanes = check_integer("lanes", lanes)
-    settings = solver_settings(solver, max_steps, starts)
+    settings = solver_settings(max_steps, starts)
     bound = problem.bound
-    check_solver_for(bound.unknowns[0], settings)
     sizes = trace_sizes(problem.n_photons, problem.n_rays, problem.max_orders, problem.plan)
     # Everything on which the results depend, by names that an error message shows.
     problem_parts = {
@@ -168,7 +164,6 @@ def retrieve_many(
         "n_photons": sizes.photons_per_batch if problem.plan is None else None,
         "n_rays": sizes.rays_per_batch if problem.plan is None else None,
         "max_orders": problem.max_orders,
-        "solver": solver,
         "max_steps": settings.max_steps,
         "starts": settings.starts,
     }

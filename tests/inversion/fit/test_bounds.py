@@ -13,7 +13,7 @@ from inversion.fit.data import ObservedWaveform
 from inversion.fit.model import Evaluation
 from inversion.fit.recorder_model import RecorderModel
 from inversion.fit.retrieval_many import LockstepModel
-from inversion.fit.solver import DEFAULT_SOLVER, LeastSquaresFit, SolverSettings
+from inversion.fit.solver import LeastSquaresFit, SolverSettings
 from inversion.fit.unknowns import BoundUnknown, Setter
 from tests.helpers import ask, run_fit, slow_unless
 
@@ -123,7 +123,7 @@ def fit_linear_problem(matrix, observed, low, high, start):
     setter = Setter(None, None, "geometric")
     unknown = BoundUnknown("x", setter, jnp.asarray(start), low, high, None)
     observation = ObservedWaveform(np.arange(samples, dtype=float), observed[None], np.ones((1, samples)))
-    recorder, settings = RecorderModel(None, [], LIDAR, samples), SolverSettings(DEFAULT_SOLVER, 50, 1)
+    recorder, settings = RecorderModel(None, [], LIDAR, samples), SolverSettings(50, 1)
     fit = LeastSquaresFit(observation, [unknown], recorder, settings)
 
     def simulate(request):

@@ -153,8 +153,6 @@ CHANGES = [
     ("scale", {"scale": (0.5, 2.0)}),
     ("key", {"key": jax.random.key(1)}),
     ("key", {"key": jax.random.key(0, impl="rbg")}),
-    ("solver", {"solver": optx.LevenbergMarquardt(rtol=1e-4, atol=1e-3)}),
-    ("solver", {"solver": optx.GaussNewton(rtol=1e-3, atol=1e-3)}),
     ("max_steps", {"max_steps": 49}),
     ("starts", {"starts": 2}),
     ("n_photons", {"n_photons": 1024}),

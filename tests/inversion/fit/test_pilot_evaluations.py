@@ -14,7 +14,6 @@ from inversion.fit.problem import BoundProblem
 from inversion.fit.recorder_model import RecorderModel
 from inversion.fit.retrieval_many import LockstepGroups, LockstepModel
 from inversion.fit.solver import (
-    DEFAULT_SOLVER,
     EvaluationRequest,
     LeastSquaresFit,
     SolverSettings,
@@ -75,7 +74,7 @@ def fit_echoes(simulation, seed, max_steps=50, progress=None):
     ]
     observation = ObservedWaveform(TIME, observed, np.full(observed.shape, SIGMA))
     recorder = RecorderModel(None, [], jl.Lidar(), TIME.size)
-    settings = SolverSettings(DEFAULT_SOLVER, max_steps, starts=1)
+    settings = SolverSettings(max_steps, starts=1)
     return run_fit(LeastSquaresFit(observation, unknowns, recorder, settings, progress).run(), simulation)
 
 

@@ -10,7 +10,6 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optimistix as optx
 import pytest
 from scipy import optimize
 
@@ -23,7 +22,7 @@ from inversion.fit.model import Evaluation
 from inversion.fit.prior_residuals import PriorResiduals
 from inversion.fit.profiles import AbstractPosterior
 from inversion.fit.recorder_model import RecorderModel
-from inversion.fit.solver import DEFAULT_SOLVER, LeastSquaresFit, SolverSettings
+from inversion.fit.solver import LeastSquaresFit, SolverSettings
 from inversion.fit.unknowns import BoundUnknown, Setter, bounds_by_name, split_by_name
 from tests.helpers import BY_PRECISION, ask, run_fit
 
@@ -64,7 +63,7 @@ def fitted(observed, smooth, **bounds):
     """Fit a record with noise of one."""
     matrix, unknowns = instrument(), unknowns_with(smooth, **bounds)
     observation = ObservedWaveform(np.arange(SAMPLES, dtype=float), observed[None], np.ones((1, SAMPLES)))
-    recorder, settings = RecorderModel(None, [], jl.Lidar(), SAMPLES), SolverSettings(DEFAULT_SOLVER, 50, 1)
+    recorder, settings = RecorderModel(None, [], jl.Lidar(), SAMPLES), SolverSettings(50, 1)
     fit = LeastSquaresFit(observation, unknowns, recorder, settings)
 
     def simulate(request):
@@ -248,7 +247,6 @@ def test_unknowns_that_are_no_profile_are_refused():
     )
     profile = profile_of(4, Smooth(2.0, mean=np.ones(3)))
     assert_refused(profile, "mean has the shape")
-    assert_refused(profile_of(4, Smooth(2.0)), "solver", solver=optx.LevenbergMarquardt(rtol=0.1, atol=0.1))
     with pytest.raises(ValueError, match="is no LogNormal, no Smooth"):
         profile_of(4, 3.0)
 

@@ -14,7 +14,7 @@ from inversion import Verdict, judge_fit, judge_record
 from inversion.fit.data import ObservedWaveform
 from inversion.fit.model import Evaluation
 from inversion.fit.recorder_model import RecorderModel
-from inversion.fit.solver import DEFAULT_SOLVER, LeastSquaresFit, SolverSettings, multistart
+from inversion.fit.solver import LeastSquaresFit, SolverSettings, multistart
 from inversion.fit.uncertainty import (
     SampleIndex,
     _autoregressive_products,
@@ -315,7 +315,7 @@ def fit_from_two_starts(batch_sigma, max_steps_elsewhere=50):
             observation,
             [unknown],
             recorder,
-            SolverSettings(DEFAULT_SOLVER, steps, 2),
+            SolverSettings(steps, 2),
             start=np.array([start]),
         )
         for start, steps in ((0.7, 50), (-0.7, max_steps_elsewhere))

@@ -6,7 +6,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optimistix as optx
 import pytest
 
 import inversion
@@ -382,15 +381,6 @@ def test_starts_and_photons_have_different_keys(monkeypatch):
     derived = [jax.random.fold_in(batch, n) for batch in batches for n in range(MIN_BATCHES)]
     of_photons = {tuple(np.asarray(jax.random.key_data(k)).tolist()) for k in [*batches, *derived]}
     assert not of_photons & {tuple(np.asarray(jax.random.key_data(k)).tolist()) for k in keys}
-
-
-def test_any_gauss_newton_method_serves():
-    solvers = [optx.GaussNewton(1e-4, 1e-4), optx.Dogleg(1e-4, 1e-4), optx.LevenbergMarquardt(1e-4, 1e-4)]
-    fits = [retrieve_ground(solver=solver) for solver in solvers]
-    for fit in fits:
-        assert_recovered(fit, {"height": 0.1, "reflectance": [0.2, 0.4]})
-    with pytest.raises(ValueError, match="no Gauss-Newton method"):
-        retrieve_ground(solver=optx.BestSoFarLeastSquares(solvers[0]))
 
 
 def test_the_plan_serves_the_corners_of_the_bounds():
