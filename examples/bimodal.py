@@ -19,9 +19,10 @@ The samplers are those of blackjax (`pip install '.[bayes]'`). It takes less tha
 """
 
 import argparse
+import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import blackjax
 import equinox as eqx
@@ -48,6 +49,7 @@ VALLEY = -0.75
 LIDAR = {"altitude": 4e5, "divergence": 0.06}
 OPTIONS = {"max_orders": 1, "n_rays": 16}
 WINDOW = (-30.0, 35.0)
+KEY = jax.random.key(1)
 
 
 def shrubs(ground: float, cover: float) -> jl.Scene:
@@ -62,66 +64,63 @@ def with_ground(scene: jl.Scene, ground: jax.Array) -> jl.Scene:
     return eqx.tree_at(lambda s: (s.ground.height, s.plates[0].height), scene, heights)
 
 
-def unknowns(ground: float = -0.75, cover: float = 0.5) -> list[inversion.Unknown]:
-    """Return the unknowns with their starts: the ground is known to 1 m from elsewhere, the cover is not."""
-    return [
-        inversion.Unknown(
-            apply=with_ground, name="ground", bounds=(-5.0, 3.0), start=ground, prior=(-0.5, 1.0)
-        ),
-        inversion.Unknown("plates[0].coverage", bounds=(0.0, 1.0), name="cover", start=cover),
-    ]
+# The ground is known to 1 m from elsewhere, the cover is not.
+UNKNOWNS = [
+    inversion.Unknown(apply=with_ground, name="ground", bounds=(-5.0, 3.0), start=-0.75, prior=(-0.5, 1.0)),
+    inversion.Unknown("plates[0].coverage", bounds=(0.0, 1.0), name="cover", start=0.5),
+]
 
 
-class Problem(NamedTuple):
-    """A noisy record, arguments of `retrieve` and `log_density`, and the log-posterior."""
+class Posterior(NamedTuple):
+    """A noisy record with its unknowns, and their log-posterior."""
 
-    arguments: tuple
-    options: dict[str, Any]
+    problem: inversion.Problem
     density: inversion.LogDensity
 
 
-def make_problem(seed: int = 3) -> Problem:
+def make_posterior(seed: int = 3) -> Posterior:
     """Simulate the record and make the density of its unknowns."""
     lidar = jl.Lidar(pulse=jl.GaussianPulse(fwhm=12.0), **LIDAR)
     scene = shrubs(**TRUTH)
     wave = jl.simulate(lidar, scene, key=jax.random.key(0), window=WINDOW, **OPTIONS)
     noise = NOISE * float(jnp.max(wave.reflectance))
     deviates = np.random.default_rng(seed).normal(size=wave.reflectance.shape)
-    arguments = (np.asarray(wave.reflectance) + noise * deviates, lidar, scene)
-    options = {"noise": noise, "time": wave.time, "key": jax.random.key(1), **OPTIONS}
-    return Problem(arguments, options, inversion.log_density(*arguments, unknowns(), **options))
+    record = np.asarray(wave.reflectance) + noise * deviates
+    problem = inversion.Problem(record, lidar, scene, UNKNOWNS, noise=noise, time=wave.time, **OPTIONS)
+    return Posterior(problem, inversion.log_density(problem, key=KEY))
 
 
-def fit(problem: Problem, ground: float, cover: float) -> inversion.Retrieval:
+def fit(posterior: Posterior, ground: float, cover: float) -> inversion.Retrieval:
     """Return the fit from a start."""
-    return inversion.retrieve(*problem.arguments, unknowns(ground, cover), **problem.options)
+    start = {"ground": ground, "cover": cover}
+    return inversion.retrieve(dataclasses.replace(posterior.problem, start=start), key=KEY)
 
 
-def on_grid(problem: Problem) -> tuple[np.ndarray, np.ndarray]:
+def on_grid(posterior: Posterior) -> tuple[np.ndarray, np.ndarray]:
     """Return heights of the ground, and their posterior probabilities, integrated over a grid of covers."""
     ground, cover = np.linspace(-2.2, 0.6, 281), (np.arange(80) + 0.5) / 80
     values = dict(zip(("ground", "cover"), np.meshgrid(ground, cover, indexing="ij")))
-    x = problem.density.to_unconstrained(values)
-    log_density = jax.jit(lambda x: jax.lax.map(problem.density, x, batch_size=256))(x.reshape(-1, 2))
+    x = posterior.density.to_unconstrained(values)
+    log_density = jax.jit(lambda x: jax.lax.map(posterior.density, x, batch_size=256))(x.reshape(-1, 2))
     # The density is one of coordinates; that of values lacks the derivatives of one by the other.
     log_density -= jnp.sum(jax.nn.log_sigmoid(x) + jax.nn.log_sigmoid(-x), axis=-1).ravel()
     weight = np.asarray(jax.nn.softmax(log_density)).reshape(ground.size, cover.size).sum(axis=1)
     return ground, weight
 
 
-def sample_nuts(problem: Problem, start: jax.Array, key: jax.Array, draws: int = 400) -> np.ndarray:
+def sample_nuts(posterior: Posterior, start: jax.Array, key: jax.Array, draws: int = 400) -> np.ndarray:
     """Return heights of the ground (draws,) from a chain of the no-U-turn sampler."""
-    adaptation = blackjax.window_adaptation(blackjax.nuts, problem.density)
+    adaptation = blackjax.window_adaptation(blackjax.nuts, posterior.density)
     adaptation_key, chain_key = jax.random.split(key)
     (state, settings), _ = adaptation.run(adaptation_key, start, 300)
-    step = blackjax.nuts(problem.density, **settings).step
+    step = blackjax.nuts(posterior.density, **settings).step
     keys = jax.random.split(chain_key, draws)
     positions = jax.lax.scan(lambda state, key: (step(key, state)[0],) * 2, state, keys)[1].position
-    return np.asarray(problem.density.to_natural(positions)["ground"])
+    return np.asarray(posterior.density.to_natural(positions)["ground"])
 
 
 def sample_tempered(
-    problem: Problem, scale: np.ndarray, key: jax.Array, islands: int = 8, particles: int = 600
+    posterior: Posterior, scale: np.ndarray, key: jax.Array, islands: int = 8, particles: int = 600
 ) -> np.ndarray:
     """Return heights of the ground (islands, particles) by tempered sequential Monte Carlo.
 
@@ -142,7 +141,7 @@ def sample_tempered(
     kernel = jax.jit(
         adaptive_tempered.build_kernel(
             log_prior,
-            lambda x: problem.density(x) - log_prior(x),
+            lambda x: posterior.density(x) - log_prior(x),
             step,
             blackjax.additive_step_random_walk.init,
             resampling.systematic,
@@ -165,14 +164,14 @@ def sample_tempered(
             raise RuntimeError(f"tempering has not come to its end in {len(keys)} steps")
         # Weights lead from the last power but one to the likelihood itself.
         chosen = resampling.systematic(end_key, state.weights, particles)
-        samples.append(np.asarray(problem.density.to_natural(state.particles[chosen])["ground"]))
+        samples.append(np.asarray(posterior.density.to_natural(state.particles[chosen])["ground"]))
     return np.stack(samples)
 
 
-def scale_of(problem: Problem, retrieval: inversion.Retrieval) -> np.ndarray:
+def scale_of(posterior: Posterior, retrieval: inversion.Retrieval) -> np.ndarray:
     """Return the standard errors (2,) of a fit in coordinates of the density."""
     ends = [
-        problem.density.to_unconstrained(
+        posterior.density.to_unconstrained(
             {
                 name: float(value) + sign * 0.1 * float(retrieval.stderr[name])
                 for name, value in retrieval.values.items()
@@ -186,7 +185,7 @@ def scale_of(problem: Problem, retrieval: inversion.Retrieval) -> np.ndarray:
 class Results(NamedTuple):
     """Fits from two starts, and heights of the ground: on a grid with probabilities, and of two samplers."""
 
-    problem: Problem
+    posterior: Posterior
     fits: list[inversion.Retrieval]
     grid: np.ndarray
     probability: np.ndarray
@@ -196,19 +195,20 @@ class Results(NamedTuple):
 
 def run() -> Results:
     """Fit, integrate and sample."""
-    problem = make_problem()
-    fits = [fit(problem, ground=-1.5, cover=0.8), fit(problem, ground=0.0, cover=0.2)]
-    grid, probability = on_grid(problem)
-    start = problem.density.to_unconstrained({k: np.asarray(v) for k, v in fits[0].values.items()})
-    nuts = sample_nuts(problem, start, jax.random.key(2))
-    tempered = sample_tempered(problem, scale_of(problem, fits[0]), jax.random.key(3))
-    return Results(problem, fits, grid, probability, nuts, tempered)
+    posterior = make_posterior()
+    fits = [fit(posterior, ground=-1.5, cover=0.8), fit(posterior, ground=0.0, cover=0.2)]
+    grid, probability = on_grid(posterior)
+    start = posterior.density.to_unconstrained({k: np.asarray(v) for k, v in fits[0].values.items()})
+    nuts = sample_nuts(posterior, start, jax.random.key(2))
+    tempered = sample_tempered(posterior, scale_of(posterior, fits[0]), jax.random.key(3))
+    return Results(posterior, fits, grid, probability, nuts, tempered)
 
 
 def draw(results: Results) -> Figure:
     """Draw the record with its two explanations, and the posterior of the ground by each method."""
     figure, (left, right) = plt.subplots(1, 2, figsize=(9.0, 3.4), layout="constrained")
-    observed, time = results.problem.arguments[0][0], np.asarray(results.problem.options["time"])
+    problem = results.posterior.problem
+    observed, time = np.asarray(problem.observed)[0], np.asarray(problem.time)
     height = -0.149896229 * time
     left.plot(1e3 * observed, height, ".", color="0.5", ms=4, label="record")
     for retrieval, colour, style in zip(results.fits, ("#0072B2", "#D55E00"), ("-", "--")):

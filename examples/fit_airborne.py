@@ -228,14 +228,13 @@ def fit(
     # From the first echo, where plants are dense, fits end in minima several metres below thin tops.
     top = highest_returns(records, windows, impulse)
     height = np.clip(np.fmax(top, [e[0] - e[-1] for e in echoes]), lowest, highest)
-    fits = inversion.retrieve_many(
+    problem = inversion.Problem(
         np.stack([w.signal for w in windows])[:, None],
         lidars,
         kind.scene,
         kind.unknowns,
         noise=np.stack([w.noise for w in windows])[:, None],
         time=time,
-        key=jax.random.key(0),
         plan=jl.plan(
             lidars[0],
             kind.largest,
@@ -246,12 +245,11 @@ def fit(
             footprint="fixed",
         ),
         start={} if kind.canopy is None else {"canopy height": height},
-        max_steps=150,
         scale=SCALE,
         recorder=recorders,
-        lanes=4,
-        path=path,
-        progress=progress,
+    )
+    fits = inversion.retrieve_many(
+        problem, key=jax.random.key(0), max_steps=150, lanes=4, path=path, progress=progress
     )
     return FittedBatch(fits, windows, recorders, top)
 

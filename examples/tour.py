@@ -55,9 +55,9 @@ def main(folder: Path) -> None:
         inversion.Unknown(lambda s: s.canopy.leaf.Cab, bounds=(5.0, 100.0), name="Cab"),
         inversion.Unknown("ground.height", bounds=(-2.0, 2.0), name="ground height", prior=(0.0, 1.0)),
     ]
-    fit = inversion.retrieve(
-        wave, LIDAR, scene_of(lad, Cab=30.0, height=0.3), unknowns, noise=1e-3, key=KEY, max_orders=1
-    )
+    start = scene_of(lad, Cab=30.0, height=0.3)
+    problem = inversion.Problem(wave, LIDAR, start, unknowns, noise=1e-3, max_orders=1)
+    fit = inversion.retrieve(problem, key=KEY)
     values: dict[str, float] = {name: float(value) for name, value in fit.values.items()}
     print(values, fit.stderr["Cab"], fit.status)
 

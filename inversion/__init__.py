@@ -2,8 +2,8 @@
 
 ## Fits with a model
 
-`retrieve`, `retrieve_many`, `Unknown`, `LogNormal`, `Smooth`, `put_profile`, `Retrieval`, `Retrievals`,
-`Step`, `AveragingKernel`.
+`Problem`, `retrieve`, `retrieve_many`, `Unknown`, `LogNormal`, `Smooth`, `put_profile`, `Retrieval`,
+`Retrievals`, `Step`, `AveragingKernel`.
 
 ## Identifiability and verdicts
 
@@ -60,6 +60,7 @@ from inversion.fit.fit_summary import Step
 from inversion.fit.identifiability import CramerRao, Profile, cramer_rao, profile_likelihood
 from inversion.fit.log_density import LogDensity, log_density
 from inversion.fit.priors import LogNormal, MarkovField, Smooth
+from inversion.fit.problem import Problem
 from inversion.fit.profiles import AveragingKernel, put_profile
 from inversion.fit.quality import Verdict, judge_fit, judge_fits, judge_record
 from inversion.fit.result import Retrieval, Retrievals
@@ -93,6 +94,7 @@ from inversion.scene.scene_retrieval import SceneRetrieval
 
 __all__ = [
     # Fits with a model.
+    "Problem",
     "retrieve",
     "retrieve_many",
     "Unknown",

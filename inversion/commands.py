@@ -16,6 +16,7 @@ import numpy as np
 
 import jaxlidar as jl
 from inversion import demo as demonstration
+from inversion.fit.problem import Problem
 from inversion.fit.retrieval import retrieve as fit_waveform
 from inversion.fit.unknowns import Unknown
 from inversion.metrics.gedi_table import gedi_table
@@ -117,15 +118,8 @@ def retrieve(
         raise click.UsageError(f"{observed} has no standard errors: give --noise")
     # Steps are for a person who watches, not for a log file.
     log = demonstration.ProgressLog(sys.stderr if sys.stderr.isatty() and not quiet else None)
-    fit = fit_waveform(
-        wave,
-        case.lidar or jl.Lidar(),
-        case.scene,
-        unknowns,
-        noise=sigma,
-        key=jax.random.key(seed),
-        progress=lambda step: log(str(step)),
-    )
+    problem = Problem(wave, case.lidar or jl.Lidar(), case.scene, unknowns, noise=sigma)
+    fit = fit_waveform(problem, key=jax.random.key(seed), progress=lambda step: log(str(step)))
     click.echo(str(fit))
     if out is not None:
         fit.save(out)

@@ -16,6 +16,7 @@ from matplotlib.figure import Figure
 
 import jaxlidar as jl
 import jaxlidar.plot
+from inversion.fit.problem import Problem
 from inversion.fit.result import Retrieval
 from inversion.fit.retrieval import retrieve
 from inversion.fit.unknowns import Unknown, bind_unknowns, set_values
@@ -130,16 +131,9 @@ def run(out: Path, *, seed: int, rtol: float, voxel_size: float, log: Callable[[
         lidar, start_scene, key=jax.random.fold_in(key, 1), plan=plan, rtol=min(2 * rtol, 0.99)
     )
     log("retrieving (compiles first)")
+    problem = Problem(observed, lidar, scene, unknowns, noise=noise, n_photons=FIT_PHOTONS, n_rays=FIT_RAYS)
     fit = retrieve(
-        observed,
-        lidar,
-        scene,
-        unknowns,
-        noise=noise,
-        key=jax.random.fold_in(key, 2),
-        n_photons=FIT_PHOTONS,
-        n_rays=FIT_RAYS,
-        progress=lambda step: log(f"  {_first_clause(step)}"),
+        problem, key=jax.random.fold_in(key, 2), progress=lambda step: log(f"  {_first_clause(step)}")
     )
     path = out / "retrieval.png"
     save(retrieval_figure(observed, noise, start, fit), path)

@@ -1,5 +1,6 @@
 """Helpers of the tests: slabs, lidars that record a whole waveform as one sample, batches and z-tests."""
 
+import dataclasses
 from collections.abc import Callable, Iterable
 from typing import Any
 
@@ -8,7 +9,11 @@ import numpy as np
 import pytest
 from jaxtyping import Array, PRNGKeyArray
 
+import inversion
 import jaxlidar as jl
+from inversion.fit.fit_summary import CompletedFit
+from inversion.fit.model import Evaluation
+from inversion.fit.solver import EvaluationRequest, FitGenerator, run_fits
 from jaxlidar.extend import side_by_side
 from jaxlidar.sampling.batch_programs import make_batch_tracer
 
@@ -34,6 +39,22 @@ BY_PRECISION = pytest.mark.parametrize(
 
 # Settings of a plan: one sample of 1000 ns centred on 400 ns, which takes in all light from -100 to 900 ns.
 SINGLE_SAMPLE = {"window": (400.0, 401.0), "bin_width": 2.0}
+
+
+def ask(function: Callable[..., Any], *arguments: Any, **options: Any) -> Any:
+    """Return what a function such as `inversion.retrieve` says of a problem that is made here.
+
+    The first four arguments, and the options with names of its fields, are those of `inversion.Problem`.
+    """
+    fields = {field.name for field in dataclasses.fields(inversion.Problem)} & options.keys()
+    problem = inversion.Problem(*arguments[:4], **{name: options.pop(name) for name in fields})
+    return function(problem, *arguments[4:], **options)
+
+
+def run_fit(fit: FitGenerator, simulate: Callable[[EvaluationRequest], Evaluation]) -> CompletedFit:
+    """Run one fit to its end."""
+    ((_, completed),) = run_fits(iter([(0, fit)]), lambda requests: {0: simulate(requests[0])}, 1)
+    return completed
 
 
 def single_sample_lidar(**changes: Any) -> jl.Lidar:

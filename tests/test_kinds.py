@@ -144,8 +144,14 @@ CALL_ENTRY_POINTS = """
 import jax, jax.numpy as jnp, numpy as np, jaxlidar as jl, inversion
 lidar, scene, key = jl.Lidar(), jl.Scene(ground=jl.Ground()), jax.random.key(0)
 plate, plan = jl.Plate(height=1.0, reflectance=0.2), jl.plan(lidar, scene)
-unknowns = [inversion.Unknown(lambda s: s.ground.height, bounds=(-2.0, 2.0), name=n) for n in "ab"]
+unknowns = [
+    inversion.Unknown("ground.height", bounds=(-2.0, 2.0), name="a"),
+    inversion.Unknown("ground.reflectance", bounds=(0.0, 1.0), name="b"),
+]
 y, t = np.ones((1, 4)), np.arange(4.0)
+def problem(observed, lidar, scene):
+    time = None if observed is None else t
+    return inversion.Problem(observed, lidar, scene, unknowns, noise=1.0, time=time)
 CALLS = {
     "simulate": lambda l, s, k: jl.simulate(l, s, key=k),
     "simulate with a plan": lambda l, s, k: jl.simulate(l, s, key=k, plan=plan),
@@ -155,13 +161,11 @@ CALLS = {
     "trace_scene": lambda l, s, k: jl.trace_scene(jl.make_setup(l, s, plan), k),
     "analog_returns": lambda l, s, k: jl.analog_returns(l, s, plan, key=k, n_photons=10),
     "photon_paths": lambda l, s, k: jl.photon_paths(l, s, plan, key=k, n_photons=10),
-    "retrieve": lambda l, s, k: inversion.retrieve(y, l, s, unknowns, noise=1.0, key=k, time=t),
-    "retrieve_many": lambda l, s, k: inversion.retrieve_many(
-        y[None], l, s, unknowns, noise=1.0, key=k, time=t
-    ),
-    "cramer_rao": lambda l, s, k: inversion.cramer_rao(l, s, unknowns, noise=1.0, key=k),
+    "retrieve": lambda l, s, k: inversion.retrieve(problem(y, l, s), key=k),
+    "retrieve_many": lambda l, s, k: inversion.retrieve_many(problem(y[None], l, s), key=k),
+    "cramer_rao": lambda l, s, k: inversion.cramer_rao(problem(None, l, s), key=k),
     "profile_likelihood": lambda l, s, k: inversion.profile_likelihood(
-        y, l, s, unknowns, "a", [0.0, 1.0], noise=1.0, key=k, time=t
+        problem(y, l, s), "a", [0.0, 1.0], key=k
     ),
 }
 WRONG_ARGUMENTS = {

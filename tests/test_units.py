@@ -12,6 +12,7 @@ import inversion
 import jaxlidar as jl
 from jaxlidar import UnitWarning
 from jaxlidar._checks import MAGNITUDES
+from tests.helpers import ask
 
 UNKNOWN = inversion.Unknown(lambda s: s.ground.reflectance, bounds=(0.0, 1.0))
 CUBE = np.full((1, 1, 1), 0.5)
@@ -82,7 +83,7 @@ def test_one_value_is_warned_of_once():
         plan = jl.plan(lidar, scene, effects={"divergence": False})
         jl.simulate(lidar, scene, key=key, plan=plan)
         jax.tree.map(lambda a: a, lidar)
-        inversion.cramer_rao(lidar, scene, [UNKNOWN], noise=0.01, key=key)
+        ask(inversion.cramer_rao, None, lidar, scene, [UNKNOWN], noise=0.01, key=key)
     with pytest.warns(UnitWarning, match="divergence") as warning_list:
         dataclasses.replace(lidar, altitude=500.0)
     assert [w.filename for w in warning_list] == [__file__]

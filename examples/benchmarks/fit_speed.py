@@ -60,9 +60,10 @@ def main() -> None:
             observed = observed + sigma * random.normal(size=observed.shape)
 
             start = time.perf_counter()
-            fit = inversion.retrieve(
-                observed, LIDAR, base, chosen_unknowns, noise=sigma, time=wave.time, key=key, plan=plan
+            problem = inversion.Problem(
+                observed, LIDAR, base, chosen_unknowns, noise=sigma, time=wave.time, plan=plan
             )
+            fit = inversion.retrieve(problem, key=key)
             ours = time.perf_counter() - start
 
             bound_unknowns = bind_unknowns(chosen_unknowns, base)

@@ -10,6 +10,7 @@ the simulation are the same at each evaluation; photons change their paths with 
 density has small jumps, which lower the acceptance.
 """
 
+import dataclasses
 import time
 
 import blackjax
@@ -36,20 +37,24 @@ def main() -> None:
     sigma = NOISE * clean.max(axis=1, keepdims=True) * np.ones_like(clean)
     observed = clean + sigma * np.random.default_rng(0).normal(size=clean.shape)
     middle = scene_of({name: 0.5 * (low + high) for name, ((low, high), _) in RANGES.items()})
-    more = {
-        "noise": sigma,
-        "time": np.asarray(wave.time),
-        "key": jax.random.key(1),
-        "plan": plan_of(arguments.photons),
-    }
+    key = jax.random.key(1)
 
     spent: dict[str, float] = {}
     start = time.perf_counter()
-    fit = inversion.retrieve(observed, LIDAR, middle, unknowns(), **more)
+    problem = inversion.Problem(
+        observed,
+        LIDAR,
+        middle,
+        unknowns(),
+        noise=sigma,
+        time=wave.time,
+        plan=plan_of(arguments.photons),
+    )
+    fit = inversion.retrieve(problem, key=key)
     spent["fit"] = time.perf_counter() - start
 
     start = time.perf_counter()
-    density = inversion.log_density(observed, LIDAR, fit.scene, unknowns(), **more)
+    density = inversion.log_density(dataclasses.replace(problem, scene=fit.scene), key=key)
     spent["density"] = time.perf_counter() - start
     first = density.to_unconstrained(fit.values)
     metric = density.to_unconstrained_covariance(fit.covariance, fit.values)

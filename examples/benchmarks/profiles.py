@@ -167,15 +167,18 @@ def compare_methods(
     plan = jl.plan(LIDAR, largest, max_orders=1, window=WINDOW, n_rays=RAYS // 8)
 
     def fit(selected: slice, path=None) -> inversion.Retrievals:
-        return inversion.retrieve_many(
+        problem = inversion.Problem(
             observed[selected, None],
             LIDAR,
             start,
             unknowns(slope),
             noise=sigma[selected, None, None],
             time=times,
-            key=jax.random.key(7),
             plan=plan,
+        )
+        return inversion.retrieve_many(
+            problem,
+            key=jax.random.key(7),
             lanes=4,
             path=path,
             progress=lambda p: print(f"\r{slope:g} degrees, orders {orders}: {p}", end="", flush=True),
@@ -240,15 +243,18 @@ def time_batch(number: int) -> dict:
     plan = jl.plan(LIDAR, start, max_orders=1, window=window, n_rays=1)
 
     def fit(selected: slice) -> inversion.Retrievals:
-        return inversion.retrieve_many(
+        problem = inversion.Problem(
             observed[selected, None],
             LIDAR,
             start,
             unknowns(None),
             noise=sigma[selected, None, None],
             time=times,
-            key=jax.random.key(7),
             plan=plan,
+        )
+        return inversion.retrieve_many(
+            problem,
+            key=jax.random.key(7),
             lanes=32,
             progress=lambda p: print(f"\rbatch: {p}", end="", flush=True),
         )

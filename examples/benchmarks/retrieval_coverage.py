@@ -125,23 +125,21 @@ def main() -> dict:
     plan = plan_of(arguments.photons // 8)
     times = np.asarray(waves[0].time)
     start = {name: random.uniform(*b, n) for name, (b, _) in RANGES.items()}
-    common = {"time": times, "key": jax.random.key(7), "plan": plan, "noise_floor": 1e-4}
+    key, common = jax.random.key(7), {"time": times, "noise_floor": 1e-4}
     middle = scene_of({k: 0.5 * (a + b) for k, ((a, b), _) in RANGES.items()})
     observed = clean + sigma * random.normal(size=clean.shape)
     arguments.out.mkdir(parents=True, exist_ok=True)
     start_time = time.perf_counter()
+    problem = inversion.Problem(
+        observed, LIDAR, middle, unknowns(), noise=sigma, start=start, plan=plan, **common
+    )
     fits = inversion.retrieve_many(
-        observed,
-        LIDAR,
-        middle,
-        unknowns(),
-        noise=sigma,
+        problem,
+        key=key,
         starts=arguments.starts,
-        start=start,
         lanes=8,
         path=arguments.out / f"retrieval_coverage_{n}.zarr",
         progress=lambda p: print(f"\r{p}", end="", flush=True),
-        **common,
     )
     seconds = {"noisy": time.perf_counter() - start_time}
     print(f"\rnoisy: {n} fits in {seconds['noisy']:.0f} s")
@@ -154,20 +152,23 @@ def main() -> dict:
         jl.simulate(LIDAR, s, key=jax.random.key(5000 + i), plan=fine, n_photons=n_photons_exact)
         for i, s in enumerate(scenes[:n_exact])
     ]
-    exact_fits = inversion.retrieve_many(
+    exact_problem = inversion.Problem(
         np.stack([np.asarray(w.reflectance, float) for w in exact]),
         LIDAR,
         middle,
         unknowns(),
         noise=0.01 * sigma[:n_exact],
         start={k: fits.values[k][:n_exact] for k in start},
-        lanes=2,
-        **common | {"plan": plan_of(n_photons_exact // 16)},
+        plan=plan_of(n_photons_exact // 16),
+        **common,
     )
+    exact_fits = inversion.retrieve_many(exact_problem, key=key, lanes=2)
     seconds["noise-free"] = time.perf_counter() - start_time
     print(f"noise-free: {n_exact} fits in {seconds['noise-free']:.0f} s")
     bounds = [
-        inversion.cramer_rao(LIDAR, s, at_truth(i, truth), noise=e, key=jax.random.key(8), plan=plan)
+        inversion.cramer_rao(
+            inversion.Problem(None, LIDAR, s, at_truth(i, truth), noise=e, plan=plan), key=jax.random.key(8)
+        )
         for i, (s, e) in enumerate(zip(scenes, sigma))
     ]
     rows, record = [], {}

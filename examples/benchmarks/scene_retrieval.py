@@ -269,18 +269,17 @@ def one_by_one(survey: jl.Survey, records: dict, n_layers: int) -> tuple[dict, i
         inversion.Unknown("ground.height", bounds=(0.0, 12.0), name="height"),
         inversion.Unknown("ground.slope", bounds=(0.0, 20.0), name="slope"),
     ]
-    fits = inversion.retrieve_many(
+    problem = inversion.Problem(
         records["observed"],
         survey.lidar,
         scene,
         unknowns,
         noise=records["noise"],
         time=records["time"],
-        key=jax.random.key(2),
         max_orders=1,
-        starts=3,
         n_rays=128,
     )
+    fits = inversion.retrieve_many(problem, key=jax.random.key(2), starts=3)
     return {name: np.asarray(a) for name, a in fits.values.items()}, int(np.sum(~np.asarray(fits.converged)))
 
 

@@ -85,19 +85,18 @@ def fit_flat_ground(shots, response):
     start, top = (jl.Scene(ground=jl.Ground(height=z, reflectance=0.3)) for z in (0.0, 1.0))
     plan = {"max_orders": 1, "window": (TIME[0], TIME[-1]), "bin_width": 1.0, "n_rays": 16}
     signal, noise = zip(*(shot.window() for shot in shots))
-    fits = inversion.retrieve_many(
+    problem = inversion.Problem(
         np.stack(signal)[:, None],
         lidars,
         start,
         [inversion.Unknown("ground.height", bounds=(-1.0, 1.0), name="ground")],
         noise=np.stack(noise)[:, None],
         time=TIME,
-        key=jax.random.key(0),
         plan=jl.plan(lidars[0], top, footprint="fixed", **plan),
         scale=SCALE,
         recorder=recorders,
-        lanes=4,
     )
+    fits = inversion.retrieve_many(problem, key=jax.random.key(0), lanes=4)
     return fits, recorders, lidars
 
 

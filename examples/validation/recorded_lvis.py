@@ -59,19 +59,18 @@ def fit_canopies(shots, signals, noise, middle):
         "n_rays": 64,
         "footprint": "fixed",
     }
-    fits = inversion.retrieve_many(
+    problem = inversion.Problem(
         np.where(outside, 0.0, power)[:, None],
         [lidar_of(pulse) for pulse in pulses],
         CANOPY.scene(10.0),
         canopy_unknowns(),
         noise=sigma[:, None],
         time=TIME,
-        key=jax.random.key(0),
         plan=jl.plan(lidar_of(jl.GaussianPulse(fwhm=40.0)), CANOPY.scene(48.0, -3.0, 25.0), **plan),
         start={"canopy height": np.clip((ABOVE - lit) * SAMPLE_RANGE, 2.0, 44.0)},
-        max_steps=100,
         scale=(0.0, 1e3),
     )
+    fits = inversion.retrieve_many(problem, key=jax.random.key(0), max_steps=100)
     return fits, power, np.isfinite(sigma)
 
 

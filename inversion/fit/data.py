@@ -18,7 +18,8 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy import linalg
 
-from jaxlidar import Lidar, Waveform
+from inversion.fit.planning import sample_times
+from jaxlidar import Lidar, Plan, Waveform
 from jaxlidar.extend import as_numpy, check_kind, check_range
 
 
@@ -126,12 +127,12 @@ def as_observed(
     observed: object,
     time: object,
     noise: object,
+    *,
     noise_floor: float,
     lidar: Lidar,
-    *,
     has_offset: bool,
 ) -> ObservedWaveform:
-    """Read and check the observation passed to `retrieve`.
+    """Read and check one record of a `Problem`.
 
     `has_offset`: True for a record with offsets of digitisers, which are no signal.
 
@@ -188,6 +189,18 @@ def as_observed(
         )
     # Samples that are left out may be NaN, which a weight of zero would not remove.
     return ObservedWaveform(t, np.where(is_fitted, y, 0.0), sigma)
+
+
+def nothing_observed(plan: Plan, noise: object, lidar: Lidar) -> ObservedWaveform:
+    """Return the samples of a plan with their noise, before anything has been recorded there.
+
+    **Raises:** ValueError for noise that is not above 0.
+    """
+    time = sample_times(plan)
+    sigma = as_noise(noise, (lidar.wavelength.size, time.size))
+    if not np.all(sigma > 0):
+        raise ValueError(f"noise = {np.min(sigma):g} is outside the admissible range (0, inf]")
+    return ObservedWaveform(time, np.zeros(sigma.shape), sigma)
 
 
 def as_noise(noise: object, shape: tuple[int, ...]) -> np.ndarray:

@@ -21,7 +21,6 @@ with one degree of freedom (Wilks 1938, Ann. Math. Stat. 9, 60).
 """
 
 import dataclasses
-import inspect
 import itertools
 from collections.abc import Callable, Sequence
 from typing import Any, final
@@ -32,16 +31,14 @@ import jax.scipy.special
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, PRNGKeyArray
 
-from inversion.fit.data import as_noise, as_sample_times, with_fixed_window
 from inversion.fit.fit_summary import CompletedFit
 from inversion.fit.model import ForwardModel
-from inversion.fit.planning import check_samples, checked_plan, plan_for_bounds, trace_sizes
 from inversion.fit.prior_residuals import fixed_priors
-from inversion.fit.retrieval import check_progress, checked_problem, fit_problem, retrieve
+from inversion.fit.problem import Problem, check_problem
+from inversion.fit.retrieval import check_progress, fit_record, solver_settings
 from inversion.fit.uncertainty import correlation_of, estimate_covariance
 from inversion.fit.unknowns import (
     BoundUnknown,
-    Unknown,
     bind_unknowns,
     flat_bounds,
     flat_labels,
@@ -51,10 +48,7 @@ from inversion.fit.unknowns import (
     split_by_name,
     with_start,
 )
-from jaxlidar import Lidar, Plan, Scene, Waveform
-from jaxlidar import plan as make_plan
-from jaxlidar.extend import as_numpy, check_key, check_kinds, check_range
-from jaxlidar.planning.plan_check import check_reach
+from jaxlidar.extend import as_numpy, check_key, check_range
 
 # Unknowns whose correlation exceeds this are named in the summary.
 _HIGH_CORRELATION = 0.95
@@ -81,7 +75,8 @@ class CramerRao(eqx.Module):
     >>> import inversion, jax
     >>> scene = jl.Scene(ground=jl.Ground())
     >>> height = inversion.Unknown(lambda s: s.ground.height, bounds=(-2.0, 2.0))
-    >>> bound = inversion.cramer_rao(jl.Lidar(), scene, [height], noise=0.001, key=jax.random.key(0))
+    >>> problem = inversion.Problem(None, jl.Lidar(), scene, [height], noise=0.001)
+    >>> bound = inversion.cramer_rao(problem, key=jax.random.key(0))
     >>> bound.labels, bound.undetermined
     (('ground.height',), ())
     """
@@ -110,38 +105,25 @@ class CramerRao(eqx.Module):
         return "\n".join(rows)
 
 
-def cramer_rao(
-    lidar: Lidar,
-    scene: Scene,
-    unknowns: Sequence[Unknown],
-    *,
-    noise: ArrayLike | Sequence,
-    key: PRNGKeyArray,
-    time: ArrayLike | Sequence | None = None,
-    plan: Plan | None = None,
-    n_photons: float | None = None,
-    n_rays: float | None = None,
-    max_orders: int | None = None,
-) -> CramerRao:
-    """Cramer-Rao bounds of the unknowns of a scene: the smallest standard errors, before data are recorded.
+def cramer_rao(problem: Problem, *, key: PRNGKeyArray) -> CramerRao:
+    """Cramer-Rao bounds of the unknowns of a problem: the smallest standard errors, before data are recorded.
 
     For independent normal noise, the Fisher information is J^T diag(1/noise^2) J, with J the derivatives of
-    the waveform at the scene's values. With priors, their precision is added: the result is then the
-    posterior covariance of the linearised problem, and no bound of unbiased estimates. An unknown with a
-    start of its own (`Unknown(start=)`) is taken there.
+    the waveform at the starting values. With priors, their precision is added: the result is then the
+    posterior covariance of the linearised problem, and no bound of unbiased estimates. A recorder's unknowns
+    and noise count; its offset and scale are fitted to the record, or, without one, in the middle of their
+    bounds.
 
     **Arguments:**
 
-    - `lidar`, `scene`, `unknowns`, `key`, `n_photons`, `n_rays`, `max_orders`: as for `retrieve`.
-    - `noise`: standard deviation of the apparent reflectance per sample, above 0, anything that broadcasts to
-      (wavelengths, bins). Infinity leaves a sample out.
-    - `time`: (bins,) ns, sample times. Default None: those of `plan`.
-    - `plan`: what to simulate (`jaxlidar.plan`). Default None: planned for the scene, and with `time` for the
-      corners of the bounds as well.
+    - `problem`: a `Problem` of one record, or with `observed=None`. Then its noise is above 0 throughout, and
+      without `time` and `plan` it is planned for the scene alone.
+    - `key`: a JAX random key.
 
     **Returns:** a `CramerRao`.
 
-    **Raises:** ValueError for inadmissible arguments, TypeError for arguments of another kind.
+    **Raises:** ValueError for a problem of many records, and for a `Smooth` prior without strength. TypeError
+    for arguments of another kind.
 
     **Source:** Kay (1993), Fundamentals of Statistical Signal Processing, chapter 3.
 
@@ -151,51 +133,35 @@ def cramer_rao(
     >>> import inversion, jax
     >>> scene = jl.Scene(ground=jl.Ground())
     >>> height = inversion.Unknown(lambda s: s.ground.height, bounds=(-2.0, 2.0), name="height")
-    >>> bound = inversion.cramer_rao(jl.Lidar(), scene, [height], noise=0.001, key=jax.random.key(0))
+    >>> problem = inversion.Problem(None, jl.Lidar(), scene, [height], noise=0.001)
+    >>> bound = inversion.cramer_rao(problem, key=jax.random.key(0))
     >>> print(f"{float(bound.stderr['height']):.3f} m")
     0.005 m
     """
-    check_kinds(lidar, scene)
+    check_problem(problem, recorded=False)
     check_key(key)
-    lidar = with_fixed_window(lidar)
-    sizes = trace_sizes(n_photons, n_rays, max_orders, plan)
-    bound_unknowns = bind_unknowns(unknowns, scene, lidar)
-    priors = fixed_priors(bound_unknowns)
-    sample_times = None if time is None else as_sample_times(time, lidar)
-    moves_lidar = any(u.setter.of_lidar for u in bound_unknowns)
-    if plan is None and sample_times is None:
-        # Derivatives are needed at the scene only: without sample times, its own plan serves.
-        photons, rays, _ = sizes
-        plan = make_plan(lidar, scene, max_orders=max_orders, n_photons=photons, n_rays=rays)
-        if moves_lidar:
-            # A plan for a beam at nadir knows no other direction, and none of its derivatives.
-            plan = plan_for_bounds(lidar, scene, bound_unknowns, _sample_times(plan), sizes)
-    elif plan is None:
-        assert sample_times is not None
-        plan = plan_for_bounds(lidar, scene, bound_unknowns, sample_times, sizes)
-    elif moves_lidar:
-        plan = checked_plan(plan, lidar, scene, bound_unknowns, _sample_times(plan), sizes)
-    else:
-        check_reach(plan, lidar, scene)
-    if sample_times is not None:
-        check_samples(plan, sample_times)
-    sigma = as_noise(noise, (lidar.wavelength.size, plan.n_samples))
-    if not np.all(sigma > 0):
-        raise ValueError(f"noise = {np.min(sigma):g} is outside the admissible range (0, inf]")
-    start = flat_start(bound_unknowns)
+    bound = problem.bound
+    unknowns, observed, recorder_model = bound.all_unknowns, bound.observed[0], bound.recorder_model(0)
+    priors = fixed_priors(unknowns)
+    start = flat_start(bound.unknowns[0])
     # All batches, as noise of the Jacobian would falsify the bound.
-    evaluation = ForwardModel(lidar, scene, plan, bound_unknowns, key)(start)
-    jacobian = (evaluation.jacobian / sigma[..., None]).reshape(-1, start.size)
-    prior_jacobian = priors(start)[1]
-    precision = prior_jacobian.T @ prior_jacobian
-    low, high = flat_bounds(bound_unknowns)
+    model = ForwardModel(bound.lidars[0], bound.scenes[0], bound.plan, bound.unknowns[0], key)
+    evaluation = model(start)
+    record = None if problem.observed is None else observed
+    recorder_start = recorder_model.start(evaluation.reflectance, record)
     # The simulation's own noise is no part of the bound.
+    noise = recorder_model.sample_noise(observed, evaluation, recorder_start, with_simulation=False)
+    recorded = recorder_model(evaluation.reflectance, evaluation.jacobian, recorder_start)
+    jacobian = noise.whiten(recorded.jacobian[observed.is_fitted])
+    prior_jacobian = priors(np.append(start, recorder_start))[1]
+    precision = prior_jacobian.T @ prior_jacobian
+    low, high = flat_bounds(unknowns)
     measurement_fraction = np.ones(len(jacobian))
     estimate = estimate_covariance(jacobian, precision, high - low, measurement_fraction, None, priors.basis)
-    labels = flat_labels(bound_unknowns)
+    labels = flat_labels(unknowns)
     std = np.sqrt(np.diag(estimate.covariance))
     return CramerRao(
-        stderr={name: jnp.asarray(s) for name, s in split_by_name(std, bound_unknowns).items()},
+        stderr={name: jnp.asarray(s) for name, s in split_by_name(std, unknowns).items()},
         covariance=jnp.asarray(estimate.covariance),
         correlation=jnp.asarray(correlation_of(estimate.covariance)),
         information=jnp.asarray(jacobian.T @ jacobian + precision),
@@ -263,19 +229,14 @@ class Profile(eqx.Module):
 
 
 def profile_likelihood(
-    observed: Waveform | ArrayLike | Sequence,
-    lidar: Lidar,
-    scene: Scene,
-    unknowns: Sequence[Unknown],
+    problem: Problem,
     name: str,
     values: ArrayLike | Sequence,
     *,
-    noise: ArrayLike | Sequence,
     key: PRNGKeyArray,
-    time: ArrayLike | Sequence | None = None,
-    plan: Plan | None = None,
+    max_steps: float = 50,
+    starts: float = 1,
     progress: Callable[[int], None] | None = None,
-    **retrieve_options: Any,
 ) -> Profile:
     """Profile likelihood of one unknown: all others are fitted at each of several fixed values of it.
 
@@ -285,13 +246,12 @@ def profile_likelihood(
 
     **Arguments:**
 
-    - `observed`, `lidar`, `scene`, `unknowns`, `noise`, `key`, `time`, `plan`: as for `retrieve`, but with
-      two unknowns or more.
+    - `problem`: a `Problem` of one record, with two unknowns or more.
     - `name`: name of the unknown that is fixed; it must be a single number. Its value is put into the scene
       before the others.
     - `values`: (points,) values of that unknown, two or more, increasing, within its bounds.
+    - `key`, `max_steps`, `starts`: as for `retrieve`.
     - `progress`: called with the index of each value when its fit has ended.
-    - `retrieve_options`: further arguments of `retrieve`, for all fits.
 
     **Returns:** a `Profile`.
 
@@ -306,61 +266,50 @@ def profile_likelihood(
     >>> wave = jl.simulate(jl.Lidar(), scene, key=jax.random.key(0))
     >>> height = inversion.Unknown(lambda s: s.ground.height, bounds=(-2.0, 2.0), name="height")
     >>> brightness = inversion.Unknown(lambda s: s.ground.reflectance, bounds=(0.0, 1.0))
-    >>> unknowns, more = [height, brightness], {"noise": 0.005, "key": jax.random.key(1)}
-    >>> values = [0.4, 0.5, 0.6]
-    >>> profile = inversion.profile_likelihood(wave, jl.Lidar(), scene, unknowns, "height", values, **more)
+    >>> problem = inversion.Problem(wave, jl.Lidar(), scene, [height, brightness], noise=0.005)
+    >>> profile = inversion.profile_likelihood(problem, "height", [0.4, 0.5, 0.6], key=jax.random.key(1))
     >>> print("{:.2f} m to {:.2f} m".format(*profile.interval()))
     0.47 m to 0.53 m
     """
-    # Arguments that `retrieve` does not have are found before the work.
-    arguments = inspect.signature(retrieve).bind(
-        observed, lidar, scene, unknowns, noise=noise, key=key, **retrieve_options
-    )
-    arguments.apply_defaults()
-    options = arguments.arguments
+    check_problem(problem)
     check_progress(progress)
     check_key(key)
-    sizes = trace_sizes(options["n_photons"], options["n_rays"], options["max_orders"], plan)
-    names = ("solver", "max_steps", "starts", "scale", "recorder", "noise_floor")
-    problem = checked_problem(
-        observed, lidar, scene, unknowns, noise=noise, time=time, **{n: options[n] for n in names}
-    )
-    priors = fixed_priors(problem.unknowns)
-    fixed = _fixed_unknown(name, problem.unknowns)
+    settings, bound = solver_settings(max_steps, starts), problem.bound
+    lidar, scene, unknowns = bound.lidars[0], bound.scenes[0], bound.unknowns[0]
+    priors = fixed_priors(unknowns)
+    fixed = _fixed_unknown(name, unknowns)
     points = as_numpy(values, "values")
     if points.ndim != 1 or points.size < 2 or not np.all(np.diff(points) > 0):
         raise ValueError(f"values has the shape {points.shape}; admissible are two or more, increasing")
     check_range("values", points, float(fixed.low), float(fixed.high))
-    plan = checked_plan(plan, problem.lidar, scene, problem.unknowns, problem.observed.time, sizes)
-    free_unknowns = [u for u, bound in zip(unknowns, problem.unknowns) if bound is not fixed]
-    # Smoothness priors without mean are about the first start, and no fit moves them.
-    levels = [bound.prior_level for bound in problem.unknowns if bound is not fixed]
+    free_unknowns = [u for u, bound_u in zip(problem.unknowns, unknowns) if bound_u is not fixed]
+    # Of the first fits, and smoothness priors without mean are about them: no fit moves these.
+    starts_of_free = {u.name: np.asarray(u.start) for u in unknowns if u is not fixed}
+    levels = [u.prior_level for u in unknowns if u is not fixed]
     middle = int(np.argmin(np.abs(points - float(fixed.start))))
     fits: dict[int, CompletedFit] = {}
     estimates: dict[int, dict[str, np.ndarray]] = {}
     for outwards in (range(middle, points.size), range(middle - 1, -1, -1)):
-        # Both directions start from the fit in the middle; None for the first one of all.
-        neighbour = estimates.get(middle)
+        # Both directions start from the fit in the middle.
+        neighbour = estimates.get(middle, starts_of_free)
         for i in outwards:
             # First of all values: the `apply` of other unknowns may depend on it.
             value = jnp.asarray(points[i], fixed.start.dtype).reshape(fixed.start.shape)
             scene_at_point = set_values(scene, (fixed.setter,), (value,))
-            lidar_at_point = set_lidar_values(problem.lidar, (fixed.setter,), (value,))
+            lidar_at_point = set_lidar_values(lidar, (fixed.setter,), (value,))
             # Bound again: they may depend on the scene.
-            bound_unknowns = bind_unknowns(free_unknowns, scene_at_point, lidar_at_point)
-            if neighbour is not None:
-                bound_unknowns = [
-                    with_start(u, jnp.asarray(neighbour[u.name], u.start.dtype)) for u in bound_unknowns
-                ]
-            bound_unknowns = [u._replace(smooth_level=v) for u, v in zip(bound_unknowns, levels)]
+            at_point = [
+                with_start(u, jnp.asarray(neighbour[u.name], u.start.dtype))._replace(smooth_level=level)
+                for u, level in zip(bind_unknowns(free_unknowns, scene_at_point, lidar_at_point), levels)
+            ]
             problem_at_point = dataclasses.replace(
-                problem, lidar=lidar_at_point, scene=scene_at_point, unknowns=bound_unknowns
+                bound, lidars=[lidar_at_point], scenes=[scene_at_point], unknowns=[at_point]
             )
             # The same photons at all values: the noise of the simulation is no part of differences in
             # chi-squared.
-            fits[i], _, recorder = fit_problem(problem_at_point, plan, key, throw=options["throw"])
-            neighbour = split_by_name(fits[i].summary.values, [*bound_unknowns, *recorder.unknowns])
-            estimates[i] = neighbour
+            fits[i] = fit_record(problem_at_point, settings, key).fit
+            estimates[i] = split_by_name(fits[i].summary.values, problem_at_point.all_unknowns)
+            neighbour = estimates[i]
             if progress is not None:
                 progress(i)
     # From the order in which fits ran to that of the values.
@@ -370,7 +319,7 @@ def profile_likelihood(
     for i, fit in fits.items():
         values_of_all = {**estimates[i], name: points[i]}
         # The prior of the fixed unknown counts as well.
-        flat = np.concatenate([np.ravel(values_of_all[u.name]) for u in problem.unknowns])
+        flat = np.concatenate([np.ravel(values_of_all[u.name]) for u in unknowns])
         residual = np.append(noise.whiten(fit.details.difference), priors(flat)[0])
         chi2[i] = residual @ residual
     return Profile(
@@ -379,11 +328,6 @@ def profile_likelihood(
         others={k: np.stack([estimates[i][k] for i in range(points.size)]) for k in estimates[middle]},
         converged=np.array([fit.summary.converged for fit in ordered]),
     )
-
-
-def _sample_times(plan: Plan) -> Float[np.ndarray, " samples"]:
-    """Return the times of the samples of a plan, ns."""
-    return plan.sample_start + plan.sample_interval * np.arange(plan.n_samples)
 
 
 def _fixed_unknown(name: str, unknowns: Sequence[BoundUnknown]) -> BoundUnknown:

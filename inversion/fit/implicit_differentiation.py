@@ -45,13 +45,14 @@ from jax.core import Tracer
 from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Float, PRNGKeyArray
 
+from inversion.fit.bounded_gauss_newton import held_by_bounds
 from inversion.fit.data import ObservedWaveform, with_fixed_window
 from inversion.fit.fit_summary import CompletedFit
 from inversion.fit.model import SimulationInputs, Values, batch_keys
 from inversion.fit.prior_residuals import PriorResiduals
 from inversion.fit.recorder_model import RecorderModel
 from inversion.fit.result import Retrieval
-from inversion.fit.solver import fit_range, held_by_bounds
+from inversion.fit.solver import fit_range
 from inversion.fit.unknowns import BoundUnknown, Setter, flat_bounds, set_values, split_values
 from jaxlidar import Plan, Waveform, total_reflectance, trace_scene
 from jaxlidar.extend import side_by_side, tensordot
@@ -62,17 +63,23 @@ _RIDGE = 1e-13
 
 
 class FitInputs(NamedTuple):
-    """Arguments of `retrieve` that JAX may be tracing. Of times and keys there are no derivatives.
+    """Numbers of a `Problem`, and of a key, that JAX may be tracing. Of the last two are no derivatives.
 
     `key_data`: of the random key, which programs cannot hand to the host as it is.
     """
 
     observed: Any
     noise: Any
-    time: Any
     lidar: Any
     scene: Any
+    time: Any
     key_data: Any
+
+    @staticmethod
+    def of(problem: Any, key: PRNGKeyArray) -> "FitInputs":
+        """Return those of a `Problem` and a key."""
+        numbers = (problem.observed, problem.noise, problem.lidar, problem.scene, problem.time)
+        return FitInputs(*numbers, jax.random.key_data(key))
 
     @property
     def is_traced(self) -> bool:

@@ -28,7 +28,7 @@ constrained variables; Gelman et al. (2013), Bayesian Data Analysis, chapter 12.
 """
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any, final
 
 import equinox as eqx
@@ -38,16 +38,13 @@ import jax.scipy.linalg
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Int, PRNGKeyArray, UInt32
 
-from inversion.fit.data import neighbour_correlation, shared_errors_of_samples
-from inversion.fit.model import ForwardModel, SimulationInputs, batch_stderr, evaluate_scene
-from inversion.fit.planning import checked_plan, trace_sizes
+from inversion.fit.data import ObservedWaveform
+from inversion.fit.model import Evaluation, ForwardModel, SimulationInputs, evaluate_scene
 from inversion.fit.prior_residuals import fixed_priors
+from inversion.fit.problem import Problem, check_problem
 from inversion.fit.recorder_model import RecorderModel
-from inversion.fit.retrieval import checked_problem
-from inversion.fit.solver import DEFAULT_SOLVER
-from inversion.fit.unknowns import Unknown, flat_bounds, flat_labels, flat_start, split_values
-from inversion.receiver.recorder import Recorder
-from jaxlidar import Lidar, Plan, Response, Scene, Waveform, total_reflectance
+from inversion.fit.unknowns import flat_bounds, flat_labels, flat_start, split_values
+from jaxlidar import Response, total_reflectance
 from jaxlidar.extend import as_numpy, check_key, check_range, matmul, tensordot
 
 Shapes = tuple[tuple[int, ...], ...]
@@ -152,7 +149,8 @@ class LogDensity(eqx.Module):
     >>> scene = jl.Scene(ground=jl.Ground(height=0.5))
     >>> wave = jl.simulate(jl.Lidar(), scene, key=jax.random.key(0))
     >>> height = inversion.Unknown("ground.height", bounds=(-2.0, 2.0), name="height")
-    >>> density = inversion.log_density(wave, jl.Lidar(), scene, [height], noise=0.01, key=jax.random.key(1))
+    >>> problem = inversion.Problem(wave, jl.Lidar(), scene, [height], noise=0.01)
+    >>> density = inversion.log_density(problem, key=jax.random.key(1))
     >>> gradient = jax.grad(density)(density.initial)
     >>> print(density.names, f"{float(density.to_natural(density.initial)['height']):.2f} m")
     ('height',) 0.50 m
@@ -319,43 +317,24 @@ class LogDensity(eqx.Module):
         return -0.5 * jnp.sum(residual**2) - jnp.sum(logarithm)
 
 
-def log_density(
-    observed: Waveform | ArrayLike | Sequence,
-    lidar: Lidar,
-    scene: Scene,
-    unknowns: Sequence[Unknown],
-    *,
-    noise: ArrayLike | Sequence,
-    key: PRNGKeyArray,
-    time: ArrayLike | Sequence | None = None,
-    plan: Plan | None = None,
-    n_photons: float | None = None,
-    n_rays: float | None = None,
-    max_orders: int | None = None,
-    scale: tuple[float, float] | None = None,
-    recorder: Recorder | None = None,
-    noise_floor: float = 1e-3,
-) -> LogDensity:
-    """Log-posterior density of the unknowns of a scene, given one waveform, for samplers of your choice.
+def log_density(problem: Problem, *, key: PRNGKeyArray) -> LogDensity:
+    """Log-posterior density of the unknowns of a problem of one record, for samplers of your choice.
 
     The prior of an unknown is its `Unknown.prior` within its bounds, or uniform within them; the likelihood
     is normal, with the noise of the record, of the simulation and of a recorded pulse, the latter two as
-    they are at the starting values. Start from a fit (`scene=fit.scene`) where these matter.
+    they are at the starting values. Start from a fit (`scene=fit.scene`) where these matter. The unknowns of
+    scale and recorder are uniform within their bounds. The strength of a `Smooth` prior must be given.
 
     Photons are traced once where all unknowns act through optics alone (leaf traits, reflectances, the
     atmosphere), and with the same random numbers at each evaluation otherwise. A gradient costs a simulation
     with its derivatives in the unknowns that need the trace, as a step of `retrieve` does.
 
-    **Arguments:**
-
-    - `observed`, `lidar`, `scene`, `unknowns`, `noise`, `key`, `time`, `plan`, `n_photons`, `n_rays`,
-      `max_orders`, `scale`, `recorder`, `noise_floor`: as for `retrieve`. The unknowns of scale and recorder
-      are uniform within their bounds. The strength of a `Smooth` prior must be given.
+    **Arguments:** `problem`: a `Problem` of one record. `key`: a JAX random key.
 
     **Returns:** a `LogDensity`.
 
-    **Raises:** ValueError for inadmissible arguments, among them a `Smooth` prior without strength, and as
-    `retrieve` does. TypeError for arguments of another kind.
+    **Raises:** ValueError for a problem of many records or none, and for a `Smooth` prior without strength.
+    TypeError for arguments of another kind.
 
     **Example:** the posterior of a reflectance by quadrature.
 
@@ -365,44 +344,23 @@ def log_density(
     >>> scene = jl.Scene(ground=jl.Ground(reflectance=0.3))
     >>> wave = jl.simulate(jl.Lidar(), scene, key=jax.random.key(0))
     >>> unknown = inversion.Unknown("ground.reflectance", bounds=(0.0, 1.0), name="R")
-    >>> density = inversion.log_density(wave, jl.Lidar(), scene, [unknown], noise=0.01, key=jax.random.key(1))
+    >>> problem = inversion.Problem(wave, jl.Lidar(), scene, [unknown], noise=0.01)
+    >>> density = inversion.log_density(problem, key=jax.random.key(1))
     >>> x = jnp.linspace(-2.0, 0.0, 201)[:, None]
     >>> weight = jax.nn.softmax(jax.vmap(density)(x))
     >>> print(f"{float(weight @ density.to_natural(x)['R']):.2f}")
     0.30
     """
+    check_problem(problem)
     check_key(key)
-    sizes = trace_sizes(n_photons, n_rays, max_orders, plan)
-    problem = checked_problem(
-        observed,
-        lidar,
-        scene,
-        unknowns,
-        noise=noise,
-        time=time,
-        solver=DEFAULT_SOLVER,
-        max_steps=1,
-        starts=1,
-        scale=scale,
-        recorder=recorder,
-        noise_floor=noise_floor,
-    )
-    observation, scene_unknowns = problem.observed, problem.unknowns
+    bound = problem.bound
+    observed, scene_unknowns, recorder_model = bound.observed[0], bound.unknowns[0], bound.recorder_model(0)
     priors = fixed_priors(scene_unknowns)
-    plan = checked_plan(plan, problem.lidar, scene, scene_unknowns, observation.time, sizes)
-    model = ForwardModel(problem.lidar, scene, plan, scene_unknowns, key)
-    recorder_model = RecorderModel(recorder, problem.scale, problem.lidar, observation.time.size)
+    model = ForwardModel(bound.lidars[0], bound.scenes[0], bound.plan, scene_unknowns, key)
     start = flat_start(scene_unknowns)
     evaluation = model(start, with_batches=True)
-    recorder_start = np.zeros(0)
-    if recorder_model.count:
-        recorder_start = recorder_model.fit_linear(
-            flat_start(recorder_model.unknowns),
-            evaluation.reflectance,
-            observation.reflectance,
-            observation.sigma,
-        )
-    all_unknowns = [*scene_unknowns, *recorder_model.unknowns]
+    recorder_start = recorder_model.start(evaluation.reflectance, observed)
+    all_unknowns = bound.all_unknowns
     low, high = flat_bounds(all_unknowns)
     fraction = (np.concatenate([start, recorder_start]) - low) / (high - low)
     simulation = _Simulation(
@@ -426,29 +384,26 @@ def log_density(
         _simulation=simulation,
         _response=None if model.retraces else evaluation.response,
         _recorder=None if records_plainly else recorder_model,
-        _noise=_record_noise(problem, recorder_model, evaluation, recorder_start),
+        _noise=_record_noise(observed, recorder_model, evaluation, recorder_start),
     )
 
 
 def _record_noise(
-    problem: Any, recorder_model: RecorderModel, evaluation: Any, recorder_values: np.ndarray
+    observed: ObservedWaveform,
+    recorder_model: RecorderModel,
+    evaluation: Evaluation,
+    recorder_values: np.ndarray,
 ) -> _RecordNoise:
     """Return the samples with weight and their noise, that of simulation and pulse at an evaluation."""
-    observation = problem.observed
-    is_fitted = observation.is_fitted
-    scale = recorder_model.scale_of(recorder_values)
-    received = None
-    if evaluation.batches is not None:
-        received = recorder_model.received(evaluation.batches, recorder_values)
-    simulation_sigma = np.broadcast_to(batch_stderr(received), is_fitted.shape)[is_fitted] / scale
-    pulse_errors = recorder_model.pulse_noise(evaluation.reflectance, recorder_values)
-    shared_errors = shared_errors_of_samples(pulse_errors, is_fitted)
-    correlation = neighbour_correlation(float(recorder_model.recorder.correlation), is_fitted)
+    is_fitted, scale = observed.is_fitted, recorder_model.scale_of(recorder_values)
+    without_measurement = observed._replace(sigma=np.where(is_fitted, 0.0, np.inf))
+    noise = recorder_model.sample_noise(without_measurement, evaluation, recorder_values)
+    shared_errors, correlation = noise.shared_errors, noise.correlation
     return _RecordNoise(
         samples=jnp.asarray(np.flatnonzero(is_fitted)),
-        observed=jnp.asarray(observation.reflectance[is_fitted]),
-        sigma=jnp.asarray(observation.sigma[is_fitted]),
-        simulation_sigma=jnp.asarray(simulation_sigma),
+        observed=jnp.asarray(observed.reflectance[is_fitted]),
+        sigma=jnp.asarray(observed.sigma[is_fitted]),
+        simulation_sigma=jnp.asarray(noise.sigma_unshared / scale),
         shared_errors=None if shared_errors is None else jnp.asarray(shared_errors / scale),
         correlation=None if correlation is None else jnp.asarray(correlation),
     )

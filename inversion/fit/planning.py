@@ -43,11 +43,12 @@ class TraceSizes(NamedTuple):
 def trace_sizes(
     n_photons: float | None, n_rays: float | None, max_orders: int | None, plan: Plan | None
 ) -> TraceSizes:
-    """Return the size of a simulation from the arguments of `retrieve`.
+    """Return the size of a simulation from the arguments of `Problem`.
 
     **Raises:** ValueError for less than one photon or ray in a batch, and for a plan that is given together
-    with a size, which it has already.
+    with a size, which it has already. TypeError for what is no plan.
     """
+    check_kind("plan", plan, Plan | None, "a Plan")
     arguments = {"n_photons": n_photons, "n_rays": n_rays, "max_orders": max_orders}
     conflicting = [name for name, value in arguments.items() if value is not None]
     if plan is not None and conflicting:
@@ -195,12 +196,48 @@ def checked_plan(
     return plan
 
 
+def plan_without_record(
+    plan: Plan | None,
+    lidar: Lidar,
+    scene: Scene,
+    unknowns: list[BoundUnknown],
+    time: Float[np.ndarray, " samples"] | None,
+    sizes: TraceSizes,
+) -> Plan:
+    """Check a plan for derivatives at the scene alone, or make one. `time`: None for samples of the plan.
+
+    **Raises:** ValueError for a plan that would leave out a part of the scene, and as `plan_for_bounds`.
+    """
+    moves_lidar = any(u.setter.of_lidar for u in unknowns)
+    if plan is None and time is None:
+        # Derivatives are needed at the scene only: without sample times, its own plan serves.
+        photons, rays, max_orders = sizes
+        plan = make_plan(lidar, scene, max_orders=max_orders, n_photons=photons, n_rays=rays)
+        if moves_lidar:
+            # A plan for a beam at nadir knows no other direction, and none of its derivatives.
+            plan = plan_for_bounds(lidar, scene, unknowns, sample_times(plan), sizes)
+    elif plan is None:
+        assert time is not None
+        plan = plan_for_bounds(lidar, scene, unknowns, time, sizes)
+    elif moves_lidar:
+        plan = checked_plan(plan, lidar, scene, unknowns, sample_times(plan), sizes)
+    else:
+        check_reach(plan, lidar, scene)
+    if time is not None:
+        check_samples(plan, time)
+    return plan
+
+
+def sample_times(plan: Plan) -> Float[np.ndarray, " samples"]:
+    """Return the times of the samples of a plan, ns."""
+    return plan.sample_start + plan.sample_interval * np.arange(plan.n_samples)
+
+
 def check_samples(plan: Plan, time: Float[np.ndarray, " samples"]) -> None:
     """Check that the samples of a plan are at `time`. **Raises:** ValueError if they are not."""
-    check_kind("plan", plan, Plan, "a Plan")
     # As for sample times: rounding of single precision is allowed.
     tolerance = 1e-3 * plan.sample_interval + 4e-7 * float(np.max(np.abs(time)))
-    expected = plan.sample_start + plan.sample_interval * np.arange(plan.n_samples)
+    expected = sample_times(plan)
     if time.size != plan.n_samples or np.max(np.abs(expected - time)) > tolerance:
         raise ValueError(
             f"time has {time.size} samples from {time[0]:g} to {time[-1]:g} ns, but the plan has "

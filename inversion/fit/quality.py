@@ -132,7 +132,8 @@ def judge_fit(fit: JudgedFit, *, about: Sequence[str] | None = None) -> Verdict:
     >>> wave = jl.simulate(jl.Lidar(), jl.Scene(ground=jl.Ground(height=0.5)), key=jax.random.key(0))
     >>> height = inversion.Unknown("ground.height", bounds=(-2.0, 0.2))
     >>> start = jl.Scene(ground=jl.Ground())
-    >>> fit = inversion.retrieve(wave, jl.Lidar(), start, [height], noise=0.001, key=jax.random.key(1))
+    >>> problem = inversion.Problem(wave, jl.Lidar(), start, [height], noise=0.001)
+    >>> fit = inversion.retrieve(problem, key=jax.random.key(1))
     >>> inversion.judge_fit(fit).quality
     'bad'
     """
@@ -156,8 +157,9 @@ def judge_fits(fits: Any, *, about: Sequence[str] | None = None) -> tuple[Verdic
     >>> scene = jl.Scene(ground=jl.Ground(height=0.5))
     >>> wave = jl.simulate(jl.Lidar(), scene, key=jax.random.key(0))
     >>> unknown = inversion.Unknown("ground.reflectance", bounds=(0.0, 1.0), name="brightness")
-    >>> more = {"noise": 0.001, "time": wave.time, "key": jax.random.key(1)}
-    >>> fits = inversion.retrieve_many(wave.reflectance[None], jl.Lidar(), scene, [unknown], **more)
+    >>> records, time = wave.reflectance[None], wave.time
+    >>> problem = inversion.Problem(records, jl.Lidar(), scene, [unknown], noise=0.001, time=time)
+    >>> fits = inversion.retrieve_many(problem, key=jax.random.key(1))
     >>> inversion.judge_fits(fits, about=["brightness"])
     (Verdict(quality='good', reasons=()),)
     """

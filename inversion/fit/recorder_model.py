@@ -25,7 +25,14 @@ import jax.numpy as jnp
 import numpy as np
 from scipy import linalg, optimize
 
-from inversion.fit.unknowns import MARGIN, BoundUnknown, Setter, with_start
+from inversion.fit.data import (
+    ObservedWaveform,
+    SampleNoise,
+    neighbour_correlation,
+    shared_errors_of_samples,
+)
+from inversion.fit.model import Evaluation, batch_stderr
+from inversion.fit.unknowns import MARGIN, BoundUnknown, Setter, flat_start, with_start
 from inversion.receiver.recorder import DELAY_NAME, OFFSET_NAME, WIDTH_NAME, ReceiverResponse, Recorder
 from jaxlidar import Lidar
 from jaxlidar.extend import concrete
@@ -137,6 +144,39 @@ class RecorderModel:
         """Return simulated batches as received and scaled, without offsets."""
         by_name = self._split(values)
         return by_name.scale * self._receive(batches, by_name)
+
+    def start(self, reflectance: np.ndarray, observed: ObservedWaveform | None) -> np.ndarray:
+        """Return starting values: those of the unknowns, with offsets and scale fitted to a record.
+
+        `observed`: None if nothing has been recorded.
+        """
+        if not self.count:
+            return np.zeros(0)
+        values = flat_start(self.unknowns)
+        if observed is None:
+            return values
+        return self.fit_linear(values, reflectance, observed.reflectance, observed.sigma)
+
+    def sample_noise(
+        self,
+        observed: ObservedWaveform,
+        evaluation: Evaluation,
+        values: np.ndarray,
+        *,
+        with_simulation: bool = True,
+    ) -> SampleNoise:
+        """Return the noise of the fitted samples: of measurement and pulse, and of a simulation.
+
+        **Arguments:** `evaluation`: the simulation. `values`: of the recorder's unknowns. `with_simulation`:
+        count its noise, if it has batches. Default True.
+        """
+        is_fitted, sigma = observed.is_fitted, observed.sigma[observed.is_fitted]
+        if with_simulation and evaluation.batches is not None:
+            stderr = batch_stderr(self.received(evaluation.batches, values))
+            sigma = np.hypot(sigma, np.broadcast_to(stderr, is_fitted.shape)[is_fitted])
+        pulse_errors = self.pulse_noise(evaluation.reflectance, values)
+        correlation = neighbour_correlation(float(self.recorder.correlation), is_fitted)
+        return SampleNoise(sigma, shared_errors_of_samples(pulse_errors, is_fitted), correlation)
 
     def fit_linear(
         self, values: np.ndarray, reflectance: np.ndarray, observed: np.ndarray, sigma: np.ndarray

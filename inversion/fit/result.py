@@ -67,7 +67,8 @@ class Retrieval(AbstractPosterior):
     >>> truth, start = jl.Scene(ground=jl.Ground(height=0.5)), jl.Scene(ground=jl.Ground())
     >>> wave = jl.simulate(jl.Lidar(), truth, key=jax.random.key(0))
     >>> height = inversion.Unknown(lambda s: s.ground.height, bounds=(-2.0, 2.0))
-    >>> fit = inversion.retrieve(wave, jl.Lidar(), start, [height], noise=0.001, key=jax.random.key(1))
+    >>> problem = inversion.Problem(wave, jl.Lidar(), start, [height], noise=0.001)
+    >>> fit = inversion.retrieve(problem, key=jax.random.key(1))
     >>> fit.converged, fit.labels, f"{float(fit.scene.ground.height):.3f} m"
     (True, ('ground.height',), '0.500 m')
     """
@@ -154,8 +155,9 @@ class Retrievals(AbstractPosterior):
     >>> scene = jl.Scene(ground=jl.Ground(height=0.5))
     >>> wave = jl.simulate(jl.Lidar(), scene, key=jax.random.key(0))
     >>> unknown = inversion.Unknown(lambda s: s.ground.reflectance, bounds=(0.0, 1.0), name="brightness")
-    >>> more = {"noise": 0.001, "time": wave.time, "key": jax.random.key(1)}
-    >>> fits = inversion.retrieve_many(wave.reflectance[None], jl.Lidar(), scene, [unknown], **more)
+    >>> records, time = wave.reflectance[None], wave.time
+    >>> problem = inversion.Problem(records, jl.Lidar(), scene, [unknown], noise=0.001, time=time)
+    >>> fits = inversion.retrieve_many(problem, key=jax.random.key(1))
     >>> fits.labels, fits.covariance.shape, fits.converged.tolist()
     (('brightness',), (1, 1, 1), [True])
     """

@@ -25,31 +25,27 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optimistix as optx
-from jaxtyping import Array, ArrayLike, PRNGKeyArray
+from jaxtyping import Array, PRNGKeyArray
 
-from inversion.fit.data import ObservedWaveform, as_noise, as_observed, with_fixed_window
 from inversion.fit.fit_summary import FitSummary
 from inversion.fit.model import Evaluation, ForwardModel, SimulationInputs, evaluate_scene
-from inversion.fit.planning import checked_plan, trace_sizes
-from inversion.fit.recorder_model import RecorderModel, check_names, recorder_unknowns
+from inversion.fit.planning import trace_sizes
+from inversion.fit.problem import BoundProblem, Problem
 from inversion.fit.result import Retrievals, retrievals_of
-from inversion.fit.retrieval import check_progress, check_solver_for, scale_unknown, solver_settings
+from inversion.fit.retrieval import check_progress, solver_settings
 from inversion.fit.solver import (
-    DEFAULT_SOLVER,
     EvaluationRequest,
     FitGenerator,
     SolverSettings,
     fits_from_starts,
     key_of_starts,
     multistart,
+    run_fits,
 )
-from inversion.fit.unknowns import BoundUnknown, Unknown, bind_unknowns, with_start
-from inversion.receiver.recorder import Recorder
-from jaxlidar import Lidar, Plan, Scene, TaskProgress
+from inversion.fit.unknowns import BoundUnknown
+from jaxlidar import Lidar, Scene, TaskProgress
 from jaxlidar.extend import (
     ONE_CORE,
-    as_numpy,
     check_integer,
     check_key,
     check_kind,
@@ -69,49 +65,26 @@ _GROUPS_PER_CHUNK = 4
 
 
 def retrieve_many(
-    observed: ArrayLike | Sequence,
-    lidar: Lidar | Sequence[Lidar],
-    scene: Scene | Sequence[Scene],
-    unknowns: Sequence[Unknown],
+    problem: Problem,
     *,
-    noise: ArrayLike | Sequence,
-    time: ArrayLike | Sequence,
     key: PRNGKeyArray,
-    plan: Plan | None = None,
-    n_photons: float | None = None,
-    n_rays: float | None = None,
-    max_orders: int | None = None,
-    solver: optx.AbstractLeastSquaresSolver = DEFAULT_SOLVER,
     max_steps: float = 50,
     starts: float = 1,
-    start: Mapping[str, ArrayLike | Sequence] | None = None,
-    scale: tuple[float, float] | None = None,
-    recorder: Recorder | Sequence[Recorder] | None = None,
-    noise_floor: float = 1e-3,
     lanes: int = 16,
     path: str | os.PathLike[str] | None = None,
     executor: Executor | None = None,
     progress: Callable[[TaskProgress], None] | None = None,
 ) -> Retrievals:
-    """Retrieve unknowns of a scene from many waveforms, each separately, as `retrieve` does for one.
+    """Retrieve the unknowns of a problem of many records, from each separately, as `retrieve` does from one.
 
-    A fit that fails says so in its status and does not affect the others. All footprints share the random
-    numbers of the simulation, so that its errors are correlated between footprints.
+    A fit that fails says so in its status and does not affect the others. All records share the random
+    numbers of the simulation, so that its errors are correlated between records.
 
     **Arguments:**
 
-    - `observed`: (footprints, wavelengths, bins) apparent reflectance, or in any other unit with `scale`.
-    - `lidar`, `scene`: one for all footprints, or one for each. Those of different footprints may differ only
-      in the values of their arrays (such as transmit pulses, or starting values).
-    - `noise`: one standard deviation, in [0, inf], anything that broadcasts to `observed`.
-    - `time`: (bins,) ns, the same for all footprints.
-    - `unknowns`, `key`, `n_photons`, `n_rays`, `max_orders`: as for `retrieve`.
-    - `solver`, `max_steps`, `starts`, `scale`, `noise_floor`: as for `retrieve`.
-    - `recorder`: as for `retrieve`, one for all footprints, or one for each, with the same unknowns.
-    - `plan`: one for all footprints. Default None: made for the first lidar and scene and the corners of the
-      bounds.
-    - `start`: by name, (footprints, ...) values that unknowns start from. Default None: their own.
-    - `lanes`: number of footprints simulated together (batch size), at least 1; memory grows with it. Default
+    - `problem`: a `Problem` of many records.
+    - `key`, `max_steps`, `starts`: as for `retrieve`.
+    - `lanes`: number of records simulated together (batch size), at least 1; memory grows with it. Default
       16.
     - `path`: a Zarr store, whose name ends in ".zarr", to which every fit is written once it has ended, so
       that a run that was interrupted or killed goes on where it stopped. It belongs to the problem:
@@ -119,17 +92,17 @@ def retrieve_many(
       change. One run at a time can use it. Damaged chunks are named in a warning and their fits are repeated.
       If it cannot be written any more, as on a full disk, a warning says so once and the fits go on. Default
       None: no store.
-    - `executor`: a `concurrent.futures.Executor`, whose workers fit chunks of footprints, as for
+    - `executor`: a `concurrent.futures.Executor`, whose workers fit chunks of records, as for
       `jaxlidar.simulate_many`. Unknowns are sent to them: give paths, or functions of a module. A chunk whose
       worker dies gets a second try. Default None: this process.
     - `progress`: called with a `TaskProgress` after every fit.
 
     **Returns:** a `Retrievals`, which does not depend on the number of workers.
 
-    **Raises:** ValueError for inadmissible arguments, as `retrieve` does, and for a `path` that is
-    damaged, no Zarr store, or one of another problem, with what differs. TypeError for arguments of another
-    kind. OSError for a `path` that cannot be written, before any fit, or that another run uses. RuntimeError
-    if the workers of a chunk die twice.
+    **Raises:** ValueError for a problem of one record and inadmissible arguments, as `retrieve` does, and for
+    a `path` that is damaged, no Zarr store, or one of another problem, with what differs. TypeError for
+    arguments of another kind. OSError for a `path` that cannot be written, before any fit, or that another
+    run uses. RuntimeError if the workers of a chunk die twice.
 
     **Example:**
 
@@ -138,96 +111,53 @@ def retrieve_many(
     >>> import numpy as np
     >>> scene = jl.Scene(ground=jl.Ground(height=0.5, reflectance=0.4))
     >>> wave = jl.simulate(jl.Lidar(), scene, key=jax.random.key(0))
-    >>> unknown = inversion.Unknown(lambda s: s.ground.reflectance, bounds=(0.0, 1.0), name="brightness")
+    >>> unknown = inversion.Unknown("ground.reflectance", bounds=(0.0, 1.0), name="brightness")
     >>> observed = np.stack([0.5 * wave.reflectance, wave.reflectance])
-    >>> more = {"noise": 0.001, "time": wave.time, "key": jax.random.key(1)}
-    >>> fits = inversion.retrieve_many(observed, jl.Lidar(), scene, [unknown], **more)
+    >>> problem = inversion.Problem(observed, jl.Lidar(), scene, [unknown], noise=0.001, time=wave.time)
+    >>> fits = inversion.retrieve_many(problem, key=jax.random.key(1))
     >>> fits.values["brightness"].round(3).tolist()
     [0.2, 0.4]
     """
-    y = as_numpy(observed, "observed")
-    if y.ndim != 3 or len(y) == 0:
-        raise ValueError(f"observed has the shape {y.shape}; admissible is (footprints, wavelengths, bins)")
-    n_footprints = len(y)
-    sigma = as_noise(noise, y.shape)
+    check_problem(problem, many=True)
     check_key(key)
     check_progress(progress)
     check_kind("path", path, str | os.PathLike | None, "a path, or None")
     check_kind("executor", executor, Executor | None, "a concurrent.futures.Executor, or None")
     lanes = check_integer("lanes", lanes)
-    settings = solver_settings(solver, max_steps, starts)
-    sizes = trace_sizes(n_photons, n_rays, max_orders, plan)
-    # Lists of one for all footprints, or of one for each. One for all is never repeated, so that arrays are
-    # neither stacked nor sent to workers more often than needed.
-    lidars = [with_fixed_window(a) for a in _one_or_each("lidar", lidar, Lidar, n_footprints)]
-    scenes = _one_or_each("scene", scene, Scene, n_footprints)
-    bound = [bind_unknowns(unknowns, a, lidars[0]) for a in scenes]
-    if any(unknown.setter.of_lidar for unknown in bound[0]):
-        # They start from the lidar of each footprint.
-        indices = range(max(len(lidars), len(scenes)))
-        cases = [(_of_footprint(scenes, i), _of_footprint(lidars, i)) for i in indices]
-        bound = [bind_unknowns(unknowns, *case) for case in cases]
-    bound = _with_starts(bound, {} if start is None else start, n_footprints)
-    check_solver_for(bound[0], settings)
-    recorders: list[Recorder | None] = (
-        [None] if recorder is None else _one_or_each("recorder", recorder, Recorder, n_footprints)
-    )
-    # Recorders of all footprints have the same unknowns.
-    has_offset = recorders[0] is not None and recorders[0].offset is not None
-    observations = [
-        as_observed(y[i], time, sigma[i], noise_floor, _of_footprint(lidars, i), has_offset=has_offset)
-        for i in range(n_footprints)
-    ]
-    sample_times = observations[0].time
-    scale_unknowns = [] if scale is None else [scale_unknown(scale, bound[0])]
-    check_names(recorders[0], bound[0])
-    of_recorder = [] if recorders[0] is None else recorder_unknowns(recorders[0])
-    # Names, shapes and bounds are those of all footprints.
-    all_unknowns = [*bound[0], *of_recorder, *scale_unknowns]
+    settings = solver_settings(max_steps, starts)
+    bound = problem.bound
+    sizes = trace_sizes(problem.n_photons, problem.n_rays, problem.max_orders, problem.plan)
     # Everything on which the results depend, by names that an error message shows.
     problem_parts = {
-        "observed": y,
-        "noise": sigma,
-        "time": sample_times,
-        "noise_floor": float(noise_floor),
-        "lidar": lidars,
-        "scene": scenes,
-        **_parts_of_unknowns(bound),
-        "scale": [(u.low, u.high) for u in scale_unknowns],
-        "recorder": recorders,
+        "observed": [record.reflectance for record in bound.observed],
+        "noise": [record.sigma for record in bound.observed],
+        "time": bound.observed[0].time,
+        "noise_floor": float(problem.noise_floor),
+        "lidar": bound.lidars,
+        "scene": bound.scenes,
+        **_parts_of_unknowns(bound.unknowns),
+        "scale": [(u.low, u.high) for u in bound.scale],
+        "recorder": bound.recorders,
         "key": key,
-        "plan": plan,
+        "plan": problem.plan,
         # A plan has its own.
-        "n_photons": sizes.photons_per_batch if plan is None else None,
-        "n_rays": sizes.rays_per_batch if plan is None else None,
-        "max_orders": max_orders,
-        "solver": solver,
+        "n_photons": sizes.photons_per_batch if problem.plan is None else None,
+        "n_rays": sizes.rays_per_batch if problem.plan is None else None,
+        "max_orders": problem.max_orders,
         "max_steps": settings.max_steps,
         "starts": settings.starts,
     }
-    # One plan, and one compiled program, serve all.
-    plan = checked_plan(plan, lidars[0], scenes[0], bound[0], sample_times, sizes)
-    problem = ManyFits(
-        numbers=range(n_footprints),
-        observed=observations,
-        lidars=lidars,
-        scenes=scenes,
-        unknowns=bound,
-        scale=scale_unknowns,
-        recorders=recorders,
-        plan=plan,
-        settings=settings,
-        groups=LockstepGroups.for_fits(min(lanes, n_footprints)),
-    )
+    n_footprints, all_unknowns = len(bound.observed), bound.all_unknowns
+    groups = LockstepGroups.for_fits(min(lanes, n_footprints))
     no_store = contextlib.nullcontext()
     with no_store if path is None else open_store(path, fingerprint(problem_parts)) as store:
         finished = FinishedFits(store, n_footprints)
         start_time, n_stored = perf_counter(), len(finished.summaries)
         missing = [i for i in range(n_footprints) if i not in finished.summaries]
         fits = (
-            run_fits(problem, key, missing)
+            fit_records(bound, settings, groups, key, missing)
             if executor is None
-            else run_fits_by_workers(executor, problem, key, missing)
+            else fit_records_by_workers(executor, bound, settings, groups, key, missing)
         )
         for i, summary in fits:
             finished.add(i, summary)
@@ -248,57 +178,6 @@ def _parts_of_unknowns(unknowns: list[list[BoundUnknown]]) -> dict[str, Any]:
         dependencies[f"prior of {u.name!r}"] = (u.prior, u.is_log_prior) if u.smooth is None else u.smooth
         dependencies[f"start of {u.name!r}"] = [u.start, *(v.start for v in in_other_footprints)]
     return dependencies
-
-
-def _with_starts(
-    unknowns: list[list[BoundUnknown]], start: Mapping[str, Any], n_footprints: int
-) -> list[list[BoundUnknown]]:
-    """Return the unknowns of every footprint with its starting values; a single list if all are the same."""
-    check_kind("start", start, Mapping, "a mapping from names of unknowns to values")
-    shapes = {u.name: u.start.shape for u in unknowns[0]}
-    starts = {}
-    for name, values in start.items():
-        if name not in shapes:
-            raise ValueError(f"start has {name!r}; admissible are {', '.join(map(repr, shapes))}")
-        starts[name] = as_numpy(values, f"start of {name!r}")
-        shape = (n_footprints, *shapes[name])
-        if starts[name].shape != shape:
-            raise ValueError(f"start of {name!r} has the shape {starts[name].shape}; admissible is {shape}")
-    # Without starts of their own, footprints share their unknowns.
-    if not starts:
-        return unknowns
-    return [
-        [
-            with_start(u, jnp.asarray(starts[u.name][i], u.start.dtype)) if u.name in starts else u
-            for u in _of_footprint(unknowns, i)
-        ]
-        for i in range(n_footprints)
-    ]
-
-
-def _one_or_each(field: str, argument: Any, kind: type, n_footprints: int) -> list[Any]:
-    """Return a list of one object for all footprints, or of one for each. **Raises:** as `retrieve_many`."""
-    if isinstance(argument, kind):
-        return [argument]
-    check_kind(field, argument, Sequence, f"one {kind.__name__}, or a sequence of one for each footprint")
-    objects = list(argument)
-    if len(objects) != n_footprints:
-        raise ValueError(
-            f"{field} has {len(objects)} elements; admissible is one, or {n_footprints} as observed"
-        )
-    for i, x in enumerate(objects):
-        check_kind(f"{field} {i}", x, kind, f"a {kind.__name__}")
-    # One compiled program serves all: structures and shapes have to agree.
-    structure, shapes = jax.tree.structure(objects[0]), jax.tree.map(jnp.shape, objects[0])
-    for i, x in enumerate(objects):
-        if jax.tree.structure(x) != structure or jax.tree.map(jnp.shape, x) != shapes:
-            raise ValueError(f"{field} {i} differs from the first in more than the values of its arrays")
-    return objects
-
-
-def _of_footprint(objects: Sequence[Any], i: int) -> Any:
-    """Return the object of footprint `i`, from one for all or one for each."""
-    return objects[0] if len(objects) == 1 else objects[i]
 
 
 class FinishedFits:
@@ -359,111 +238,62 @@ class LockstepGroups(NamedTuple):
         return LockstepGroups(n_threads, -(-n_fits // n_threads))
 
 
-@dataclasses.dataclass(frozen=True)
-class ManyFits:
-    """The fits of many footprints.
-
-    `lidars`, `scenes`, `unknowns` and `recorders` have one object for all footprints, or one for each.
-
-    - `numbers`: of the footprints; their random keys are made from these.
-    - `observed`: waveform of each.
-    - `unknowns`: of the scene.
-    - `scale`: the unknown "scale", or empty.
-    - `groups`: sizes of lockstep groups.
-    """
-
-    numbers: Sequence[int]
-    observed: list[ObservedWaveform]
-    lidars: list[Lidar]
-    scenes: list[Scene]
-    unknowns: list[list[BoundUnknown]]
-    scale: list[BoundUnknown]
-    recorders: list[Recorder | None]
-    plan: Plan
-    settings: SolverSettings
-    groups: LockstepGroups
-
-    def subset(self, indices: Sequence[int]) -> "ManyFits":
-        """Return the fits of some footprints, on one core."""
-
-        def of_subset(objects: list[Any]) -> list[Any]:
-            # One for all stays one for all, unless there is one footprint anyway.
-            is_shared = len(objects) == 1 < len(self.observed)
-            return objects if is_shared else [objects[i] for i in indices]
-
-        return dataclasses.replace(
-            self,
-            numbers=[self.numbers[i] for i in indices],
-            observed=of_subset(self.observed),
-            lidars=of_subset(self.lidars),
-            scenes=of_subset(self.scenes),
-            unknowns=of_subset(self.unknowns),
-            recorders=of_subset(self.recorders),
-            groups=self.groups._replace(n_threads=1),
-        )
-
-
-def run_fits(
-    problem: ManyFits, key: PRNGKeyArray, indices: Sequence[int]
+def fit_records(
+    problem: BoundProblem,
+    settings: SolverSettings,
+    groups: LockstepGroups,
+    key: PRNGKeyArray,
+    indices: Sequence[int],
 ) -> Iterator[tuple[int, FitSummary]]:
-    """Fit the footprints at these indices of a problem in lockstep. Yield index and summary as fits end."""
+    """Fit the records at these indices of a problem in lockstep. Yield index and summary as fits end."""
 
     def fit_of(i: int) -> FitGenerator:
-        observed, lidar = problem.observed[i], _of_footprint(problem.lidars, i)
-        recorder = _of_footprint(problem.recorders, i)
-        recorder_model = RecorderModel(recorder, problem.scale, lidar, observed.time.size)
         # It determines the starting points alone, which do not depend on the chunk or on earlier runs.
         start_key = jax.random.fold_in(key_of_starts(key), problem.numbers[i])
-        unknowns = _of_footprint(problem.unknowns, i)
-        return multistart(fits_from_starts(observed, unknowns, recorder_model, problem.settings, start_key))
+        unknowns, recorder = problem.unknowns_of(i), problem.recorder_model(i)
+        return multistart(fits_from_starts(problem.observed[i], unknowns, recorder, settings, start_key))
 
-    # The photons of all footprints have the same key, as those of a single fit: results do not depend on the
+    # The photons of all records have the same key, as those of a single fit: results do not depend on the
     # chunk.
-    simulate = LockstepModel(problem, key)
-    # The fits that run at present, with the request that each waits for.
-    waiting, running = list(indices), dict[int, tuple[FitGenerator, EvaluationRequest]]()
-    while waiting or running:
-        # A fit that has ended makes room at once: in groups of fits that begin and end together, most members
-        # would be idle until the slowest fit has ended.
-        while waiting and len(running) < problem.groups.n_fits:
-            i = waiting.pop(0)
-            fit = fit_of(i)
-            running[i] = fit, next(fit)
-        for i, evaluation in simulate({i: request for i, (_, request) in running.items()}).items():
-            fit = running[i][0]
-            try:
-                # The fit goes on to its next request, or ends.
-                running[i] = fit, fit.send(evaluation)
-            except StopIteration as end:
-                del running[i]
-                yield i, end.value.summary
+    simulate = LockstepModel(problem, groups, key)
+    for i, fit in run_fits(((i, fit_of(i)) for i in indices), simulate, groups.n_fits):
+        yield i, fit.summary
 
 
-def run_fits_by_workers(
-    executor: Executor, problem: ManyFits, key: PRNGKeyArray, indices: Sequence[int]
+def fit_records_by_workers(
+    executor: Executor,
+    problem: BoundProblem,
+    settings: SolverSettings,
+    groups: LockstepGroups,
+    key: PRNGKeyArray,
+    indices: Sequence[int],
 ) -> Iterator[tuple[int, FitSummary]]:
-    """Fit the footprints as `run_fits`, in chunks by the workers of an executor."""
-    size = _GROUPS_PER_CHUNK * problem.groups.fits_per_thread
+    """Fit the records as `fit_records`, in chunks by the workers of an executor."""
+    size = _GROUPS_PER_CHUNK * groups.fits_per_thread
     chunks = [indices[i : i + size] for i in range(0, len(indices), size)]
+    # A worker has one core.
+    more = settings, groups._replace(n_threads=1)
     # Arrays and names instead of summaries: a task's result is a tree of arrays.
-    tasks = [task(n, _fit_chunk, (problem.subset(chunk),), key) for n, chunk in enumerate(chunks)]
+    tasks = [task(n, _fit_chunk, (problem.subset(chunk), *more), key) for n, chunk in enumerate(chunks)]
     for completed, summaries in outcomes(tasks, executor):
         for i, arrays in zip(chunks[completed.number], summaries):
             yield i, FitSummary.from_arrays(arrays)
 
 
-def _fit_chunk(problem: ManyFits, key: PRNGKeyArray) -> list[dict[str, Any]]:
-    """Fit a chunk of footprints in a worker."""
+def _fit_chunk(
+    problem: BoundProblem, settings: SolverSettings, groups: LockstepGroups, key: PRNGKeyArray
+) -> list[dict[str, Any]]:
+    """Fit a chunk of records in a worker."""
     indices = range(len(problem.numbers))
-    summaries = dict(run_fits(problem, key, indices))
+    summaries = dict(fit_records(problem, settings, groups, key, indices))
     return [summaries[i].to_arrays() for i in indices]
 
 
 class LockstepModel:
     """The simulated waveforms of all running fits: one compiled call for each thread's group."""
 
-    def __init__(self, problem: ManyFits, key: PRNGKeyArray):
-        self.lidars, self.scenes, self.groups = problem.lidars, problem.scenes, problem.groups
+    def __init__(self, problem: BoundProblem, groups: LockstepGroups, key: PRNGKeyArray):
+        self.lidars, self.scenes, self.groups = problem.lidars, problem.scenes, groups
         self.model = ForwardModel(self.lidars[0], self.scenes[0], problem.plan, problem.unknowns[0], key)
 
     def __call__(self, requests: Mapping[int, EvaluationRequest]) -> dict[int, Evaluation]:
@@ -516,7 +346,7 @@ def _stacked(objects: list[Any], members: list[int]) -> Any:
     """Return one object for all, or the members' objects with their arrays stacked."""
     if len(objects) == 1:
         return objects[0]
-    # Fields that are no arrays are equal (`_one_or_each`).
+    # Fields that are no arrays are equal (`inversion.fit.problem`).
     dynamic, static = zip(*(eqx.partition(objects[i], eqx.is_array) for i in members))
     return eqx.combine(jax.tree.map(lambda *a: jnp.stack(a), *dynamic), static[0])
 

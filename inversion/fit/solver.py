@@ -20,49 +20,27 @@ evaluation, are accurate enough. The fit descends with them until a step is belo
 on with all batches. Estimates, covariances and chi-squared come from all batches (variable sample size:
 Pasupathy 2010, Oper. Res. 58, 889).
 
-**Steps.** Steps are taken in natural units, scaled to the widths of the bounds. A bijection of the bounded
-unknowns onto unbounded ones would be flat at the bounds: a fit that came near one would hardly leave it
-again, and small steps there are no sign of a minimum.
-
-Without smoothness priors, a Gauss-Newton method of optimistix (Levenberg-Marquardt by default) proposes
-steps. A step that leaves the bounds, or a box about the present values (trust region), is replaced by the
-minimum of the linearised problem within both: bounded-variable least squares (Stark and Parker 1995, Comput.
-Stat. 10, 129). A mere projection need not improve the fit if unknowns are correlated. The box shrinks to a
-quarter of a rejected step, and grows fourfold with an accepted one.
-
-With smoothness priors, layers without plants lie at their lower bound, many at a time, and come off it as
-others change. Every step is then that minimum within the bounds, and is cut to a quarter until it improves
-the fit.
-
-**Stopping rule.** A fit has converged when a Gauss-Newton step would lower chi-squared by less than 0.05^2
-(the Newton decrement, a length in standard errors, is below 0.05), or below a larger limit after rejected
-steps: see `_STALL_LIMITS`. After rejected steps, 0.05 standard errors are those that include misfit. The
-decrement is that of the unknowns that no bound holds. The termination of optimistix's method, which sees
-small steps, counts as many rejected ones. If the decrement is larger, the steps are small because rejected
-ones have raised the damping, and the method starts afresh.
+**Steps.** Those of `inversion.fit.bounded_gauss_newton`, a solver of optimistix: damped Gauss-Newton steps
+within the bounds and a trust region, until a step would be below 0.05 standard errors, or no step improves
+the fit. `optimistix.least_squares` runs that solver as well, but as one compiled loop, in which fits that run
+together all wait for the slowest, and none reports its steps or goes over to all batches. Here each step is
+one call of the solver, and a fit simulates between them.
 
 **Fits as generators.** A fit yields the values at which it needs a simulation and is sent the evaluation. The
 same code serves a single fit and many fits whose simulations run in one compiled call.
 """
 
 import dataclasses
-from collections.abc import Callable, Generator, Sequence
-from typing import Any, NamedTuple
+import itertools
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from typing import NamedTuple
 
-import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
-import optimistix as optx
-from jaxtyping import Array, Bool, Float, PRNGKeyArray
-from scipy import linalg, optimize
+from jaxtyping import Float, PRNGKeyArray
 
-from inversion.fit.data import (
-    ObservedWaveform,
-    SampleNoise,
-    neighbour_correlation,
-    shared_errors_of_samples,
-)
+from inversion.fit.bounded_gauss_newton import BoundedGaussNewton, advance
+from inversion.fit.data import ObservedWaveform, SampleNoise
 from inversion.fit.fit_summary import CompletedFit, FitDetails, FitSummary, Step
 from inversion.fit.model import Evaluation, batch_stderr
 from inversion.fit.prior_residuals import PriorResiduals
@@ -71,7 +49,6 @@ from inversion.fit.uncertainty import (
     EstimateCovariance,
     SampleIndex,
     estimate_covariance,
-    newton_decrement,
     residual_covariance,
 )
 from inversion.fit.unknowns import (
@@ -82,17 +59,10 @@ from inversion.fit.unknowns import (
     flat_start,
     split_by_name,
 )
-from jaxlidar.extend import matmul
 
-# A fit has converged if a Gauss-Newton step would move it by less than this many standard errors.
-_SMALL_STEP = 0.05
-# Pairs (n, limit): it has also converged if n or more steps in a row were rejected and the step is below
-# limit standard errors.
-_STALL_LIMITS = ((1, 0.3), (3, 0.6), (8, 1.0))
-# The same for pilot evaluations, whose noise hides smaller steps; the fit then goes on with all batches.
-_PILOT_SMALL_STEP, _PILOT_STALL_LIMITS = 1.0, ((1, 2.0), (3, 5.0))
-# Largest change of an unknown in one step, in widths of its bounds: the simulation is linear only nearby.
-_MAX_STEP = 0.4
+# Pilot evaluations have noise that hides smaller steps; the fit then goes on with all batches.
+_SOLVER = BoundedGaussNewton()
+_PILOT_SOLVER = BoundedGaussNewton(atol=1.0, rtol=1.0, limits=(2.0, 2.0, 5.0))
 # At the solution the weights are renewed if they differ from those of the start by more than this, in the
 # mean.
 _MAX_WEIGHT_CHANGE = 0.05
@@ -103,25 +73,12 @@ _STRENGTH_TOLERANCE, _MAX_STRENGTH_UPDATES = 0.1, 12
 # Values of a fit keep off their bounds by this fraction of the bounds' width: a log-normal prior has no
 # logarithm of zero, and an extinction of zero has no score.
 _BOUND_MARGIN = 1e-6
-# An unknown closer to the end of its range than this fraction of the bounds' width is at it: steps are
-# rounded to single precision.
-_END_OF_RANGE = 1e-6
-# Factor of a step that does not improve the fit.
-_STEP_CUT = 0.25
-# Added to the diagonal of the information, as a fraction of its trace: undetermined unknowns stay where they
-# are.
-_RIDGE = 1e-13
-# Residual of a simulation that is not finite: so large that any solver rejects the step.
-_REJECTED_RESIDUAL = 1e8
-
-DEFAULT_SOLVER = optx.LevenbergMarquardt(rtol=1e-3, atol=1e-3)
 
 
 @dataclasses.dataclass(frozen=True)
 class SolverSettings:
-    """Gauss-Newton method of optimistix, most simulations from each start, and number of starts."""
+    """Most simulations from each start, and number of starts."""
 
-    solver: optx.AbstractLeastSquaresSolver
     max_steps: int
     starts: int
 
@@ -142,71 +99,35 @@ class EvaluationRequest(NamedTuple):
 FitGenerator = Generator[EvaluationRequest, Evaluation, CompletedFit]
 
 
-def run_fit(fit: FitGenerator, simulate: Callable[[EvaluationRequest], Evaluation]) -> CompletedFit:
-    """Run one fit to its end."""
-    try:
-        request = next(fit)
-        while True:
-            request = fit.send(simulate(request))
-    except StopIteration as end:
-        return end.value
+def run_fits(
+    fits: Iterator[tuple[int, FitGenerator]],
+    simulate: Callable[[Mapping[int, EvaluationRequest]], Mapping[int, Evaluation]],
+    n_together: int,
+) -> Iterator[tuple[int, CompletedFit]]:
+    """Run numbered fits in lockstep. Yield each with its number as it ends.
 
+    **Arguments:**
 
-# -- Gauss-Newton steps of optimistix
-
-
-def _linear_model(y: Array, args: tuple[Array, Array, Array]) -> tuple[Array, None]:
-    """Residuals linearised about `y0`: all that a Gauss-Newton step needs of the simulation.
-
-    optimistix differentiates its residual function itself; given this one, it takes residual and Jacobian as
-    data, and the solver compiles once for all fits of equal shapes.
+    - `simulate`: evaluates the requests of all running fits, by their numbers.
+    - `n_together`: most fits that run at a time.
     """
-    y0, residual, jacobian = args
-    return residual + matmul(jacobian, y - y0), None
-
-
-@eqx.filter_jit
-def _initial_state(solver: Any, y: Array, args: Any) -> Any:
-    struct = eqx.filter_eval_shape(lambda: _linear_model(y, args)[0])
-    return solver.init(_linear_model, y, args, {}, struct, None, frozenset())
-
-
-@eqx.filter_jit
-def _advance(solver: Any, y: Array, args: Any, state: Any) -> Any:
-    """Return the accepted point, the state with the next trial, and flags: terminated, successful."""
-    y, state, _ = solver.step(_linear_model, y, args, {}, state, frozenset())
-    terminated, result = solver.terminate(_linear_model, y, args, {}, state, frozenset())
-    return y, state, terminated, result == optx.RESULTS.successful
-
-
-# -- bounded Gauss-Newton step
-
-
-def bounded_step(
-    jacobian: Float[np.ndarray, "data n"],
-    residual: Float[np.ndarray, " data"],
-    low: Float[np.ndarray, " n"],
-    high: Float[np.ndarray, " n"],
-) -> tuple[Float[np.ndarray, " n"], float]:
-    """Return the step within bounds that minimises the linearised residuals, and its length.
-
-    The length is in standard errors: the root of the fall in chi-squared.
-    """
-    width = high - low
-    scaled = jacobian * width
-    information = scaled.T @ scaled
-    # Normal equations: there are far more samples than unknowns. With L L^T = information (Cholesky) and
-    # b = -L^-1 J^T r, |L^T step - b| is the same problem with as many rows as unknowns.
-    # The floor lets the decomposition succeed for a Jacobian of zeros: then the step is zero.
-    information += _RIDGE * max(np.trace(information), 1e-300) * np.eye(width.size)
-    cholesky = np.linalg.cholesky(information)
-    target = linalg.solve_triangular(cholesky, -scaled.T @ residual, lower=True)
-    # An active-set method ends with values exactly at their bounds; interior methods only come near them.
-    bounds = (low / width, high / width)
-    step = optimize.lsq_linear(cholesky.T, target, bounds=bounds, method="bvls").x * width
-    # Of the problem itself, without the ridge.
-    decrease = residual @ residual - np.sum((residual + jacobian @ step) ** 2)
-    return step, float(np.sqrt(max(decrease, 0.0)))
+    # The fits that run at present, with the request that each waits for.
+    running: dict[int, tuple[FitGenerator, EvaluationRequest]] = {}
+    while True:
+        # A fit that has ended makes room at once: in groups of fits that begin and end together, most members
+        # would be idle until the slowest fit has ended.
+        for number, fit in itertools.islice(fits, n_together - len(running)):
+            running[number] = fit, next(fit)
+        if not running:
+            return
+        for number, evaluation in simulate({n: request for n, (_, request) in running.items()}).items():
+            fit, _ = running[number]
+            try:
+                # The fit goes on to its next request, or ends.
+                running[number] = fit, fit.send(evaluation)
+            except StopIteration as end:
+                del running[number]
+                yield number, end.value
 
 
 def fit_range(
@@ -215,22 +136,6 @@ def fit_range(
     """Return the range of the values of a fit within bounds."""
     margin = _BOUND_MARGIN * (high - low)
     return low + margin, high - margin
-
-
-def held_by_bounds(
-    values: Float[np.ndarray, " n"],
-    residual: Float[np.ndarray, " data"],
-    jacobian: Float[np.ndarray, "data n"],
-    lowest: Float[np.ndarray, " n"],
-    highest: Float[np.ndarray, " n"],
-) -> Bool[np.ndarray, " n"]:
-    """Return True for unknowns at an end of their range that the minimum within it has there as well."""
-    end = _END_OF_RANGE * (highest - lowest)
-    is_at_end = (values < lowest + end) | (values > highest - end)
-    if not np.any(is_at_end):
-        return is_at_end
-    step, _ = bounded_step(jacobian, residual, lowest - values, highest - values)
-    return is_at_end & (np.abs(step) < end)
 
 
 # -- a fit from one start
@@ -291,8 +196,8 @@ class LeastSquaresFit:
         self.n_scene = self.low.size - recorder_model.count
         self.start = flat_start(self.unknowns) if start is None else start
         self.prior = PriorResiduals(self.unknowns)
-        self.correlation = neighbour_correlation(float(recorder_model.recorder.correlation), self.is_fitted)
-        self.noise = SampleNoise(observed.sigma[self.is_fitted], None, self.correlation)
+        # That of simulation and pulse is added at the first iterate.
+        self.noise = SampleNoise(observed.sigma[self.is_fitted])
         # A single simulation has to be one with all batches.
         self.use_pilot = settings.max_steps > 1
         self.n_simulations, self.history = 0, []
@@ -313,24 +218,11 @@ class LeastSquaresFit:
         jacobian = np.concatenate([self.noise.whiten(iterate.jacobian), prior_jacobian])
         return np.concatenate([self.noise.whiten(iterate.difference), prior_residual]), jacobian
 
-    def cost(self, iterate: Iterate) -> float:
-        """Return the objective."""
-        residual, _ = self.residuals(iterate)
-        return float(residual @ residual)
-
     def update_weights(self, iterate: Iterate) -> float:
         """Renew the noise of simulation and pulse at an iterate. **Returns:** the mean relative change."""
-        batches = iterate.evaluation.batches
-        received = None if batches is None else self.recorder_model.received(batches, iterate.recorder_values)
-        simulation_sigma = np.broadcast_to(batch_stderr(received), self.is_fitted.shape)[self.is_fitted]
-        pulse_errors = self.recorder_model.pulse_noise(
-            iterate.evaluation.reflectance, iterate.recorder_values
-        )
         previous_sigma = self.noise.sigma
-        self.noise = SampleNoise(
-            np.hypot(self.observed.sigma[self.is_fitted], simulation_sigma),
-            shared_errors_of_samples(pulse_errors, self.is_fitted),
-            self.correlation,
+        self.noise = self.recorder_model.sample_noise(
+            self.observed, iterate.evaluation, iterate.recorder_values
         )
         return float(np.mean(np.abs(self.noise.sigma / previous_sigma - 1.0)))
 
@@ -404,8 +296,7 @@ class LeastSquaresFit:
         3. Repeat until no strength changes by more than 10 %.
         """
         for _ in range(_MAX_STRENGTH_UPDATES):
-            descend = self._bounded_gauss_newton if self.prior.processes else self._gauss_newton
-            best, converged, status = yield from descend(best)
+            best, converged, status = yield from self._descend(best)
             if not converged or not self.prior.has_free_strengths:
                 return Descent(best, converged, status)
             residual, jacobian = self.noise.whiten(best.difference), self.noise.whiten(best.jacobian)
@@ -416,142 +307,34 @@ class LeastSquaresFit:
         status = "not converged: the strength of a smoothness prior did not settle"
         return Descent(best, False, self._status(status))
 
-    def _gauss_newton(self, best: Iterate) -> Generator[EvaluationRequest, Evaluation, Descent]:
-        """Descend with steps of a Gauss-Newton method of optimistix, kept within the bounds, from `best`.
+    def _descend(self, best: Iterate) -> Generator[EvaluationRequest, Evaluation, Descent]:
+        """Descend from `best` with the steps of `BoundedGaussNewton`, one simulation each.
 
-        Its parameters y are the distances from the start of the descent, in widths of the bounds.
-
-        1. Give the solver residual and Jacobian at the trial; it accepts the trial or goes back to `best`.
-        2. Stop if the Newton decrement at the best iterate is small, by the solver's own rule, if many steps
-           in a row were rejected, or at max_steps.
-        3. Simulate at the solver's next trial, or at the minimum of the linearised problem within bounds and
-           trust region if the trial is beyond them.
+        1. Give the solver residual and Jacobian at its trial; it accepts the trial or goes back to `best`.
+        2. Stop where the solver does, or at max_steps.
+        3. Simulate at the solver's next trial.
         """
-        origin, trial, state, step_limit = best.values, best, None, _MAX_STEP
-        # Distances rather than values: in single precision, values far below the width would be rounded.
-        y = y_trial = jnp.zeros(origin.size)
-        y_range = [jnp.asarray((end - origin) / self.width, y.dtype) for end in (self.lowest, self.highest)]
-        decrement, n_rejected, best_residual, best_jacobian = np.inf, 0, np.zeros(0), np.zeros(0)
+        solver = _PILOT_SOLVER if self.use_pilot else _SOLVER
+        trial, state = best, None
         while True:
             residual, jacobian = self.residuals(trial)
             if not trial.is_finite:
-                residual, jacobian = np.full_like(residual, _REJECTED_RESIDUAL), np.zeros_like(jacobian)
-            args = tuple(jnp.asarray(a, y.dtype) for a in (y_trial, residual, jacobian * self.width))
-            if state is None:
-                state = _initial_state(self.settings.solver, y, args)
-            y, state, terminated, successful = _advance(self.settings.solver, y, args, state)
-            # An accepted trial is the solver's new point, bit by bit.
-            accepted = bool(jnp.all(y == args[0])) and trial.is_finite
-            if accepted:
-                best, best_residual, best_jacobian, n_rejected = trial, residual, jacobian, 0
-                is_held = held_by_bounds(best.values, residual, jacobian, self.lowest, self.highest)
-                decrement = newton_decrement(jacobian[:, ~is_held], residual)
-                step_limit = min(_MAX_STEP, step_limit / _STEP_CUT)
-            else:
-                n_rejected += 1
-                step_limit = _STEP_CUT * float(jnp.max(jnp.abs(y_trial - y)))
-            self._report(trial, accepted)
-            # The solver's termination sees that steps are small, as many rejected steps do.
-            n_without_progress = (
-                max(n_rejected, self._stall_limits[-1][0]) if bool(terminated) else n_rejected
-            )
-            if self._has_converged(decrement, n_without_progress, best_residual):
-                return Descent(best, True, self._status("converged"))
-            if not bool(successful):
-                status = "failed: the equations for the next step could not be solved"
-                return Descent(best, False, self._status(status))
-            # As for bounded steps: no sign of a minimum.
-            if n_rejected > _STALL_LIMITS[-1][0]:
-                return Descent(best, False, self._status("failed: no step improves the fit"))
+                residual, jacobian = np.full_like(residual, np.inf), np.zeros_like(jacobian)
+            bounds = self.lowest, self.highest
+            descent = advance(solver, state, trial.values, residual, jacobian, bounds)
+            state = descent.state
+            if descent.accepted:
+                best = trial
+            self._report(trial, descent.accepted)
+            if descent.terminated:
+                end = "converged" if descent.successful else "failed: no step improves the fit"
+                return Descent(best, descent.successful, self._status(end))
             if self._is_exhausted:
                 return Descent(best, False, self._status("not converged: stopped at max_steps"))
-            if bool(terminated):
-                # Small steps, and yet no minimum: rejected ones have raised the damping.
-                state = _initial_state(self.settings.solver, y, args)
-                y, state, _, _ = _advance(self.settings.solver, y, args, state)
-                step_limit = _MAX_STEP
-            # Changed within the solver's state: the solver predicts the fall of the cost from the trial
-            # itself, and so judges the shorter step by the right number.
-            step = self.width * np.asarray(state.y_eval - y, float)
-            step = self._step_within(step, best.values, best_residual, best_jacobian, step_limit)
-            y_trial = jnp.clip(y + jnp.asarray(step / self.width, y.dtype), *y_range)
-            state = eqx.tree_at(lambda s: s.y_eval, state, y_trial)
-            trial = yield from self.simulate(origin + self.width * np.asarray(y_trial, float))
+            trial = yield from self.simulate(descent.trial)
             self.n_simulations += 1
 
-    def _step_within(
-        self,
-        step: np.ndarray,
-        values: np.ndarray,
-        residual: np.ndarray,
-        jacobian: np.ndarray,
-        step_limit: float,
-    ) -> np.ndarray:
-        """Return a step if it keeps within bounds and trust region, else the bounded step within both.
-
-        `step_limit`: half of the trust region, in widths of the bounds.
-        """
-        low = np.maximum(self.lowest - values, -step_limit * self.width)
-        high = np.minimum(self.highest - values, step_limit * self.width)
-        if np.all((step >= low) & (step <= high)):
-            return step
-        # A damping of one width, as Levenberg-Marquardt has at first, holds unknowns that the data do not
-        # determine.
-        jacobian = np.concatenate([jacobian, np.diag(1.0 / self.width)])
-        return bounded_step(jacobian, np.append(residual, np.zeros(values.size)), low, high)[0]
-
-    def _bounded_gauss_newton(self, best: Iterate) -> Generator[EvaluationRequest, Evaluation, Descent]:
-        """Descend with steps that are solved within the bounds, from `best`.
-
-        1. Solve the linearised problem within the bounds: a step and its length in standard errors.
-        2. Stop if the length is small, or at max_steps.
-        3. Simulate after the step; cut it to a quarter until it improves the fit.
-        """
-        self._report(best, True)
-        while True:
-            residual, jacobian = self.residuals(best)
-            step, length = bounded_step(
-                jacobian, residual, self.lowest - best.values, self.highest - best.values
-            )
-            fraction, n_rejected, accepted = 1.0, 0, False
-            while not accepted:
-                if self._has_converged(length, n_rejected, residual):
-                    return Descent(best, True, self._status("converged"))
-                # A step that promises more than the noise of the simulation explains, while not even a tiny
-                # part of it improves the fit, is no sign of a minimum: the Jacobian is wrong.
-                if n_rejected > self._stall_limits[-1][0]:
-                    return Descent(best, False, self._status("failed: no step improves the fit"))
-                if self._is_exhausted:
-                    return Descent(best, False, self._status("not converged: stopped at max_steps"))
-                trial = yield from self.simulate(best.values + fraction * step)
-                self.n_simulations += 1
-                accepted = trial.is_finite and self.cost(trial) < float(residual @ residual)
-                self._report(trial, accepted)
-                fraction, n_rejected = fraction * _STEP_CUT, n_rejected + 1
-            best = trial
-
-    # -- stopping rule
-
-    @property
-    def _stall_limits(self) -> tuple[tuple[int, float], ...]:
-        return _PILOT_STALL_LIMITS if self.use_pilot else _STALL_LIMITS
-
-    def _has_converged(self, length: float, n_rejected: int, residual: np.ndarray) -> bool:
-        """Return True for a step of this length, in standard errors, after so many rejected steps.
-
-        `residual`: at the point that the step starts from.
-        """
-        small_step = _PILOT_SMALL_STEP if self.use_pilot else _SMALL_STEP
-        if length < small_step:
-            return True
-        # With misfit, errors are larger than the stated ones. Not before a step was rejected: far from the
-        # solution, where residuals are large, short steps may lead to it.
-        degrees_of_freedom = max(residual.size - 2 * self.low.size, 1)
-        relative_misfit = np.sqrt(max(float(residual @ residual) / degrees_of_freedom, 1.0))
-        return any(
-            n_rejected >= n and length < max(limit, small_step * relative_misfit)
-            for n, limit in self._stall_limits
-        )
+    # -- end of a fit
 
     @property
     def _is_exhausted(self) -> bool:

@@ -209,25 +209,6 @@ def correlation_of(covariance: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n
     return correlation
 
 
-def newton_decrement(jacobian: Float[np.ndarray, "data n"], residual: Float[np.ndarray, " data"]) -> float:
-    """Return the length of a Gauss-Newton step in standard errors: the root of the fall in chi-squared.
-
-    (r^T J (J^T J)^-1 J^T r)^1/2, which is the norm of r projected onto the columns of J.
-    """
-    norm = np.linalg.norm(jacobian, axis=0)
-    is_sensitive = norm > 0
-    if not np.any(is_sensitive):
-        return 0.0
-    # Along a direction with a tiny singular value, the predicted fall in chi-squared would take a step far
-    # beyond the range in which the simulation is linear: it does not count.
-    scaled = jacobian[:, is_sensitive] / norm[is_sensitive]
-    basis, singular_value, _ = np.linalg.svd(scaled, full_matrices=False)
-    return float(np.linalg.norm(basis[:, singular_value > _MIN_SINGULAR_VALUE].T @ residual))
-
-
-# -- misfit
-
-
 class ResidualCovariance(NamedTuple):
     """Covariance C of the residuals of a fit, as the sandwich needs it.
 

@@ -29,6 +29,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 import jaxlidar as jl
+from inversion.fit.problem import Problem
 from inversion.fit.quality import Verdict, judge_fits
 from inversion.fit.result import Retrievals
 from inversion.fit.retrieval_many import retrieve_many
@@ -254,21 +255,18 @@ def _fit(
         n_rays=256,
         footprint="fixed",
     )
-    return retrieve_many(
+    problem = Problem(
         np.stack([p.signal for p in prepared])[:, None],
         [lidar_of(_padded_pulse(p.shot, size)) for p in prepared],
         CANOPY.scene(10.0),
         canopy_unknowns(),
         noise=np.stack([p.noise for p in prepared])[:, None],
         time=np.arange(-_ABOVE, _BELOW + 1),
-        key=jax.random.key(0),
         plan=plan,
         start={"canopy height": np.array([p.height for p in prepared])},
-        max_steps=100,
         scale=_GAINS,
-        path=path,
-        progress=progress,
     )
+    return retrieve_many(problem, key=jax.random.key(0), max_steps=100, path=path, progress=progress)
 
 
 def _padded_pulse(shot: Any, size: int) -> jl.SampledPulse:

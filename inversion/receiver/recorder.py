@@ -73,9 +73,10 @@ class Recorder(eqx.Module):
     >>> pedestals = np.where(np.arange(wave.time.size) % 2, 0.03, 0.02)
     >>> height = inversion.Unknown("ground.height", bounds=(-2.0, 2.0), name="height")
     >>> recorder = inversion.Recorder(width=(0.1, 5.0), offset=(-0.1, 0.1), interleaved=2)
-    >>> options = {"noise": 0.001, "time": wave.time, "key": jax.random.key(1), "scale": (0.1, 10.0)}
     >>> record = np.asarray(wave.reflectance)[0] + pedestals
-    >>> fit = inversion.retrieve(record, jl.Lidar(), start, [height], recorder=recorder, **options)
+    >>> instrument = {"recorder": recorder, "scale": (0.1, 10.0), "noise": 0.001, "time": wave.time}
+    >>> problem = inversion.Problem(record, jl.Lidar(), start, [height], **instrument)
+    >>> fit = inversion.retrieve(problem, key=jax.random.key(1))
     >>> print(f"{float(fit.values['receiver width']):.1f} ns", fit.values["offset"].round(3))
     2.0 ns [0.02 0.03]
     """

@@ -116,10 +116,11 @@ class Medium(eqx.Module):
 
     def relative_angle_slope(self, w: Vec) -> Scalar | None:
         """Relative slope of the extinction of leaf by the vertical component of `w`; None without angles."""
-        if self.angle_tables is None:
+        tables = self.angle_tables
+        if tables is None:
             return None
         value, slope = jax.jvp(
-            lambda z: self.angle_tables.projection_at((w[0], w[1], z)), (w[2],), (jnp.ones_like(w[2]),)
+            lambda z: tables.projection_at((w[0], w[1], z)), (w[2],), (jnp.ones_like(w[2]),)
         )
         return slope / jnp.maximum(value, 1e-30)
 

@@ -10,7 +10,7 @@ import pytest
 
 import inversion
 import jaxlidar as jl
-from tests.helpers import SINGLE_SAMPLE, first_wave, one_batch, single_sample_lidar
+from tests.helpers import SINGLE_SAMPLE, ask, first_wave, one_batch, single_sample_lidar
 from tests.stability.hard_answers import value_and_slope
 from tests.stability.hard_cases import CASES, KNOWN_FAILURES
 from tests.stability.hard_families import FAMILIES
@@ -185,7 +185,9 @@ def test_a_canopy_from_400_km_as_from_1_km(precision):
 def fitted(observed, lidar, start, unknowns):
     noise = 0.01 * float(np.max(observed.reflectance))
     sizes = {"n_photons": 4096, "n_rays": 1024, "max_orders": 1}
-    return inversion.retrieve(observed, lidar, start, unknowns, noise=noise, key=jax.random.key(1), **sizes)
+    return ask(
+        inversion.retrieve, observed, lidar, start, unknowns, noise=noise, key=jax.random.key(1), **sizes
+    )
 
 
 @pytest.mark.slow

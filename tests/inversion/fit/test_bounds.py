@@ -13,9 +13,9 @@ from inversion.fit.data import ObservedWaveform
 from inversion.fit.model import Evaluation
 from inversion.fit.recorder_model import RecorderModel
 from inversion.fit.retrieval_many import LockstepModel
-from inversion.fit.solver import DEFAULT_SOLVER, LeastSquaresFit, SolverSettings, run_fit
+from inversion.fit.solver import LeastSquaresFit, SolverSettings
 from inversion.fit.unknowns import BoundUnknown, Setter
-from tests.helpers import slow_unless
+from tests.helpers import ask, run_fit, slow_unless
 
 LIDAR = jl.Lidar()
 HEIGHT, REFLECTANCE = (-2.0, 2.0), (0.05, 0.9)
@@ -39,7 +39,7 @@ def wave_of(height, reflectance):
 def fit_ground(truth, start, unknowns=None, **options):
     options = {"noise": 1e-4, "key": jax.random.key(1), **options}
     unknowns = unknowns_with() if unknowns is None else unknowns
-    return inversion.retrieve(wave_of(*truth), LIDAR, ground(*start), unknowns, **options)
+    return ask(inversion.retrieve, wave_of(*truth), LIDAR, ground(*start), unknowns, **options)
 
 
 # Echoes of start and truth overlap little: the reflectance falls to its bound before the height has moved.
@@ -67,7 +67,8 @@ def test_a_fit_that_came_to_a_bound_leaves_it(truth, start):
 def test_many_fits_leave_their_bounds():
     truths, starts = zip(*FAR_STARTS)
     waves = [wave_of(*truth) for truth in truths]
-    fits = inversion.retrieve_many(
+    fits = ask(
+        inversion.retrieve_many,
         np.stack([wave.reflectance for wave in waves]),
         LIDAR,
         [ground(*start) for start in starts],
@@ -107,7 +108,7 @@ def test_wide_bounds_and_log_normal_priors_from_zero_are_no_obstacle():
     unknowns = unknowns_with(reflectance=(0.0, 1.0), prior=prior)
     wave = wave_of(0.4, 0.25)
     options = {"noise": 1e-4, "time": wave.time, "key": jax.random.key(1), "scale": (0.01, 1e3)}
-    fit = inversion.retrieve(0.5 * wave.reflectance, LIDAR, ground(0.0, 0.9), unknowns, **options)
+    fit = ask(inversion.retrieve, 0.5 * wave.reflectance, LIDAR, ground(0.0, 0.9), unknowns, **options)
     assert fit.converged, fit.status
     assert float(fit.values["reflectance"]) == pytest.approx(0.25, rel=3e-3)
     assert float(fit.values["scale"]) == pytest.approx(0.5, rel=3e-3)
@@ -122,7 +123,7 @@ def fit_linear_problem(matrix, observed, low, high, start):
     setter = Setter(None, None, "geometric")
     unknown = BoundUnknown("x", setter, jnp.asarray(start), low, high, None)
     observation = ObservedWaveform(np.arange(samples, dtype=float), observed[None], np.ones((1, samples)))
-    recorder, settings = RecorderModel(None, [], LIDAR, samples), SolverSettings(DEFAULT_SOLVER, 50, 1)
+    recorder, settings = RecorderModel(None, [], LIDAR, samples), SolverSettings(50, 1)
     fit = LeastSquaresFit(observation, [unknown], recorder, settings)
 
     def simulate(request):
@@ -169,7 +170,8 @@ def test_a_fit_without_random_numbers_requests_no_evaluation_twice(monkeypatch):
 
     monkeypatch.setattr(LockstepModel, "__call__", record_and_evaluate)
     wave = wave_of(0.4, 0.25)
-    fits = inversion.retrieve_many(
+    fits = ask(
+        inversion.retrieve_many,
         wave.reflectance[None],
         LIDAR,
         ground(0.0, 0.5),
@@ -195,8 +197,14 @@ def test_offsets_of_digitisers_are_no_signal():
     options = {"key": jax.random.key(1), "time": wave.time, "recorder": recorder}
     for noise in (0.01 * peak, 0.0):
         without, with_pedestal = (
-            inversion.retrieve(
-                record + offset, LIDAR, ground(0.3, 0.2), unknowns_with(), noise=noise, **options
+            ask(
+                inversion.retrieve,
+                record + offset,
+                LIDAR,
+                ground(0.3, 0.2),
+                unknowns_with(),
+                noise=noise,
+                **options,
             )
             for offset in (0.0, 20.0 * peak)
         )

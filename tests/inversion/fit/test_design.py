@@ -9,6 +9,7 @@ import inversion
 import jaxlidar as jl
 from inversion import Unknown
 from inversion.fit.design_trace import DivergenceNodes
+from tests.helpers import ask
 
 LIDAR = jl.Lidar(wavelength=680.0, altitude=4e5, divergence=0.01, pulse=jl.GaussianPulse(fwhm=8.0))
 UNKNOWNS = [
@@ -42,7 +43,9 @@ def reference_cost(wavelength, fwhm, scenes, plan_window=(-120.0, 60.0)):
     costs = []
     for scene in scenes:
         plan = jl.plan(lidar, scene, window=plan_window, **FAST)
-        bound = inversion.cramer_rao(lidar, scene, UNKNOWNS, noise=NOISE, key=jax.random.key(0), plan=plan)
+        bound = ask(
+            inversion.cramer_rao, None, lidar, scene, UNKNOWNS, noise=NOISE, key=jax.random.key(0), plan=plan
+        )
         costs.append(sum((float(bound.stderr[name]) / width) ** 2 for name, width in widths.items()))
     return np.mean(costs)
 
@@ -104,7 +107,9 @@ def bare_ground_cost(unknowns, scene, window, noise, **lidar_options):
     """Return the relative variances of bare ground by `cramer_rao`."""
     lidar = jl.Lidar(altitude=4e5, pulse=jl.GaussianPulse(fwhm=6.0), **lidar_options)
     plan = jl.plan(lidar, scene, window=window)
-    bound = inversion.cramer_rao(lidar, scene, unknowns, noise=noise, key=jax.random.key(0), plan=plan)
+    bound = ask(
+        inversion.cramer_rao, None, lidar, scene, unknowns, noise=noise, key=jax.random.key(0), plan=plan
+    )
     widths = {u.name: float(u.bounds[1] - u.bounds[0]) for u in unknowns}
     return sum((float(bound.stderr[name]) / width) ** 2 for name, width in widths.items())
 

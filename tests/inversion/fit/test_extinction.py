@@ -17,7 +17,7 @@ import jaxlidar as jl
 from inversion.fit import model as fit_model
 from inversion.fit.model import ForwardModel, choose_jacobian_methods, max_columns_per_voxel
 from inversion.fit.unknowns import bind_unknowns, flat_start
-from tests.helpers import BY_PRECISION
+from tests.helpers import BY_PRECISION, ask
 
 KEY = jax.random.key(7)
 LIDAR = jl.Lidar(wavelength=(532.0, 1064.0), divergence=2.0)
@@ -144,7 +144,15 @@ def test_layers_are_retrieved():
     scene = scene_with()
     truth = scale_layers(scene, jnp.linspace(0.7, 1.3, LAYERS))
     wave = jl.simulate(LIDAR, truth, key=jax.random.key(1), max_orders=1)
-    fit = inversion.retrieve(
-        wave, LIDAR, scene, [LAYER_FACTORS], noise=1e-5, key=KEY, max_orders=1, n_rays=8192
+    fit = ask(
+        inversion.retrieve,
+        wave,
+        LIDAR,
+        scene,
+        [LAYER_FACTORS],
+        noise=1e-5,
+        key=KEY,
+        max_orders=1,
+        n_rays=8192,
     )
     np.testing.assert_allclose(fit.values["layers"], np.linspace(0.7, 1.3, LAYERS), atol=0.05)

@@ -18,6 +18,7 @@ import jaxlidar as jl
 from inversion import LogNormal, Unknown
 from jaxlidar._fingerprint import digest_of
 from jaxlidar.optics.coefficients import Coefficients, shipped
+from tests.helpers import ask
 
 TIME = np.arange(-60.0, 21.0)
 VOXELS = jl.VoxelMap.from_lad(np.full((1, 1, 3), 0.3), voxel_size=(9.0, 9.0, 1.0), origin=(-4.5, -4.5, 2.0))
@@ -78,7 +79,7 @@ def starts_work(**problem):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("inversion.fit.retrieval_many.LockstepModel", start)
         try:
-            inversion.retrieve_many(**problem)
+            ask(inversion.retrieve_many, **problem)
         except SimulationStartedError:
             return True
 
@@ -152,8 +153,6 @@ CHANGES = [
     ("scale", {"scale": (0.5, 2.0)}),
     ("key", {"key": jax.random.key(1)}),
     ("key", {"key": jax.random.key(0, impl="rbg")}),
-    ("solver", {"solver": optx.LevenbergMarquardt(rtol=1e-4, atol=1e-3)}),
-    ("solver", {"solver": optx.GaussNewton(rtol=1e-3, atol=1e-3)}),
     ("max_steps", {"max_steps": 49}),
     ("starts", {"starts": 2}),
     ("n_photons", {"n_photons": 1024}),

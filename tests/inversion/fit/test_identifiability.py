@@ -10,6 +10,7 @@ import pytest
 import inversion
 import jaxlidar as jl
 from inversion import LogNormal, Recorder, Unknown
+from tests.helpers import ask
 
 LIDAR = jl.Lidar(wavelength=(532.0, 1064.0), pulse=jl.GaussianPulse(fwhm=6.0), divergence=1e-3)
 REFLECTANCE = np.array([0.2, 0.4])
@@ -34,7 +35,7 @@ def pulse_at(time, height=0.1):
 
 
 def test_bounds_of_a_flat_ground_are_the_closed_form():
-    bound = inversion.cramer_rao(LIDAR, SCENE, UNKNOWNS, noise=NOISE, key=KEY)
+    bound = ask(inversion.cramer_rao, None, LIDAR, SCENE, UNKNOWNS, noise=NOISE, key=KEY)
     plan = jl.plan(LIDAR, SCENE)
     time = plan.sample_start + np.arange(plan.n_samples)
     echo, slope = pulse_at(time)
@@ -55,8 +56,8 @@ def test_priors_add_to_the_information():
         name="reflectance",
         prior=LogNormal(REFLECTANCE, 0.001),
     )
-    bound = inversion.cramer_rao(LIDAR, SCENE, [with_prior], noise=NOISE, key=KEY)
-    data_bound = inversion.cramer_rao(LIDAR, SCENE, [BRIGHTNESS], noise=NOISE, key=KEY)
+    bound = ask(inversion.cramer_rao, None, LIDAR, SCENE, [with_prior], noise=NOISE, key=KEY)
+    data_bound = ask(inversion.cramer_rao, None, LIDAR, SCENE, [BRIGHTNESS], noise=NOISE, key=KEY)
     # Information adds up; the spread of a log-normal prior is relative.
     expected = 1 / np.hypot(1 / (0.001 * REFLECTANCE), 1 / np.asarray(data_bound.stderr["reflectance"]))
     assert np.allclose(bound.stderr["reflectance"], expected, rtol=1e-3)
@@ -74,12 +75,14 @@ def test_chlorophyll_is_invisible_at_1064_nm():
         Unknown(lambda s: s.canopy.leaf.Cm, bounds=(0.001, 0.03), name="Cm"),
     ]
     options = {"noise": 1e-4, "key": KEY, "max_orders": 1, "n_rays": 64}
-    infrared = inversion.cramer_rao(jl.Lidar(wavelength=1064.0), scene, unknowns, **options)
+    infrared = ask(inversion.cramer_rao, None, jl.Lidar(wavelength=1064.0), scene, unknowns, **options)
     assert infrared.undetermined == ("Cab",)
     assert np.isinf(infrared.stderr["Cab"])
     assert np.isfinite(infrared.stderr["Cm"])
     assert "Cab  not determined" in str(infrared)
-    with_green = inversion.cramer_rao(jl.Lidar(wavelength=(532.0, 1064.0)), scene, unknowns, **options)
+    with_green = ask(
+        inversion.cramer_rao, None, jl.Lidar(wavelength=(532.0, 1064.0)), scene, unknowns, **options
+    )
     assert with_green.undetermined == ()
 
 
@@ -94,14 +97,14 @@ def target():
 def profile(target, name, values, unknowns=UNKNOWNS, lidar=LIDAR, **options):
     observed, time = target
     options = {"noise": NOISE, "time": time, "key": KEY, "noise_floor": 0.0, **options}
-    return inversion.profile_likelihood(observed, lidar, SCENE, unknowns, name, values, **options)
+    return ask(inversion.profile_likelihood, observed, lidar, SCENE, unknowns, name, values, **options)
 
 
 @pytest.mark.slow
 def test_a_profile_of_a_linear_problem_is_the_standard_error(target):
     observed, time = target
-    fit = inversion.retrieve(
-        observed, LIDAR, SCENE, UNKNOWNS, noise=NOISE, time=time, key=KEY, noise_floor=0.0
+    fit = ask(
+        inversion.retrieve, observed, LIDAR, SCENE, UNKNOWNS, noise=NOISE, time=time, key=KEY, noise_floor=0.0
     )
     best, error = float(fit.values["height"]), float(fit.stderr["height"])
     finished = []
@@ -125,11 +128,18 @@ def test_all_points_of_a_profile_are_weighted_alike():
     wave = jl.simulate(lidar, scene, key=KEY, plan=plan)
     unknowns = [HEIGHT, Unknown("ground.reflectance", bounds=(0.05, 0.9), name="brightness")]
     options = {"noise": 1e-3, "time": wave.time, "key": KEY, "recorder": recorder}
-    fit = inversion.retrieve(wave.reflectance, lidar, scene, unknowns, **options)
+    fit = ask(inversion.retrieve, wave.reflectance, lidar, scene, unknowns, **options)
     z = np.linspace(-3.0, 3.0, 7)
     values = float(fit.values["brightness"]) + float(fit.stderr["brightness"]) * z
-    result = inversion.profile_likelihood(
-        wave.reflectance, lidar, scene, unknowns, "brightness", values, **options
+    result = ask(
+        inversion.profile_likelihood,
+        wave.reflectance,
+        lidar,
+        scene,
+        unknowns,
+        "brightness",
+        values,
+        **options,
     )
     assert np.allclose(result.chi2, z**2, rtol=0.05, atol=0.05)
 
@@ -157,8 +167,15 @@ def test_a_profile_does_not_move_smoothness_priors():
     def estimates(first, values):
         height = Unknown("ground.height", bounds=(-2.0, 2.0), start=first, name="height")
         scene = inversion.put_profile(base, start)
-        result = inversion.profile_likelihood(
-            wave.reflectance, LIDAR, scene, [height, plants], "height", values, **options
+        result = ask(
+            inversion.profile_likelihood,
+            wave.reflectance,
+            LIDAR,
+            scene,
+            [height, plants],
+            "height",
+            values,
+            **options,
         )
         return result.others["plants"]
 
@@ -177,7 +194,7 @@ def test_samples_lie_at_the_record_s_times_whatever_opened_the_window(target):
     first_return = dataclasses.replace(LIDAR, receiver=jl.Receiver(window="first return"))
     for times in ({"time": target[1]}, {}):
         bound, expected = (
-            inversion.cramer_rao(lidar, SCENE, UNKNOWNS, noise=NOISE, key=KEY, **times)
+            ask(inversion.cramer_rao, None, lidar, SCENE, UNKNOWNS, noise=NOISE, key=KEY, **times)
             for lidar in (first_return, LIDAR)
         )
         assert np.array_equal(bound.covariance, expected.covariance)
@@ -199,14 +216,14 @@ def test_bad_input_is_refused(target):
         with pytest.raises(ValueError, match=message):
             profile(target, **{"name": "height", "values": [0.0, 0.1], **change})
     with pytest.raises(ValueError, match="noise = 0 is outside"):
-        inversion.cramer_rao(LIDAR, SCENE, UNKNOWNS, noise=0.0, key=KEY)
+        ask(inversion.cramer_rao, None, LIDAR, SCENE, UNKNOWNS, noise=0.0, key=KEY)
     with pytest.raises(ValueError, match="does not broadcast"):
-        inversion.cramer_rao(LIDAR, SCENE, UNKNOWNS, noise=np.ones(3), key=KEY)
+        ask(inversion.cramer_rao, None, LIDAR, SCENE, UNKNOWNS, noise=np.ones(3), key=KEY)
     with pytest.raises(ValueError, match="unknowns is empty; admissible is one unknown or more"):
-        inversion.cramer_rao(LIDAR, SCENE, [], noise=NOISE, key=KEY)
+        ask(inversion.cramer_rao, None, LIDAR, SCENE, [], noise=NOISE, key=KEY)
     for name in ("n_photons", "n_rays"):
         with pytest.raises(ValueError, match=rf"{name} = 4 is outside the admissible range \[8, inf\)"):
-            inversion.cramer_rao(LIDAR, SCENE, UNKNOWNS, noise=NOISE, key=KEY, **{name: 4})
+            ask(inversion.cramer_rao, None, LIDAR, SCENE, UNKNOWNS, noise=NOISE, key=KEY, **{name: 4})
     result = profile(target, "height", [0.08, 0.12])
     with pytest.raises(ValueError, match="level = 1 is outside"):
         result.interval(1.0)
@@ -220,10 +237,17 @@ def test_plans_that_leave_out_light_are_refused():
     bright = inversion.Unknown("ground.reflectance", bounds=(0.0, 1.0), name="bright")
     options = {"noise": 0.01, "key": KEY, "time": time, "plan": plan}
     with pytest.raises(ValueError, match="the plan does not fit: its rays start"):
-        inversion.cramer_rao(lidar, high_scene, [height], **options)
+        ask(inversion.cramer_rao, None, lidar, high_scene, [height], **options)
     with pytest.raises(
         ValueError, match="at the bounds of the unknowns the plan does not fit: its rays start"
     ):
-        inversion.profile_likelihood(
-            np.zeros((1, time.size)), lidar, low_scene, [height, bright], "bright", [0.2, 0.4], **options
+        ask(
+            inversion.profile_likelihood,
+            np.zeros((1, time.size)),
+            lidar,
+            low_scene,
+            [height, bright],
+            "bright",
+            [0.2, 0.4],
+            **options,
         )

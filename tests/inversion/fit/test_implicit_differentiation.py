@@ -14,6 +14,7 @@ import inversion
 import jaxlidar as jl
 from inversion import LogNormal, Recorder, Unknown
 from inversion.fit.data import SampleNoise
+from tests.helpers import ask
 
 WINDOW = (-30.0, 30.0)
 TRUTH = jl.Scene(ground=jl.Ground(height=0.5, reflectance=0.3, slope=5.0))
@@ -32,7 +33,7 @@ TIME, RECORD = np.asarray(WAVE.time), jnp.asarray(WAVE.reflectance)
 def estimates(record, noise=0.002, fwhm=4.0, slope=5.0, unknowns=(HEIGHT, REFLECTANCE), **options):
     scene = jl.Scene(ground=jl.Ground(slope=slope))
     more = {"noise": noise, "time": TIME, "key": jax.random.key(1)} | options
-    values = inversion.retrieve(record, lidar_of(fwhm), scene, list(unknowns), **more).values
+    values = ask(inversion.retrieve, record, lidar_of(fwhm), scene, list(unknowns), **more).values
     return jnp.stack([value for _, value in sorted(values.items())])
 
 
@@ -110,7 +111,7 @@ def test_several_wavelengths_and_left_out_samples():
 
     def reflectance(record):
         more = {"noise": noise, "time": wave.time, "key": jax.random.key(1)}
-        return inversion.retrieve(record, lidar, TRUTH, [REFLECTANCE], **more).values["reflectance"]
+        return ask(inversion.retrieve, record, lidar, TRUTH, [REFLECTANCE], **more).values["reflectance"]
 
     gradient = jax.grad(reflectance)(record)
     np.testing.assert_array_equal(gradient[0], 0.0)
@@ -123,7 +124,9 @@ def test_a_waveform_and_the_fitted_scene():
 
     def reflectance_of_fit(wave):
         scene, key = jl.Scene(ground=jl.Ground()), jax.random.key(1)
-        fits.append(inversion.retrieve(wave, lidar_of(), scene, [REFLECTANCE, HEIGHT], noise=0.002, key=key))
+        fits.append(
+            ask(inversion.retrieve, wave, lidar_of(), scene, [REFLECTANCE, HEIGHT], noise=0.002, key=key)
+        )
         return fits[-1].scene.ground.reflectance
 
     gradient = eqx.filter_grad(reflectance_of_fit)(WAVE)
@@ -137,7 +140,7 @@ def test_within_programs():
 
     def fit(record):
         unknowns, more = [HEIGHT, REFLECTANCE], {"noise": 0.002, "time": TIME, "key": key}
-        return inversion.retrieve(record, lidar_of_program, scene, unknowns, **more)
+        return ask(inversion.retrieve, record, lidar_of_program, scene, unknowns, **more)
 
     lidar_of_program = lidar_of()
     alone, within = fit(RECORD), jax.jit(fit)(RECORD)
@@ -195,7 +198,7 @@ def test_a_canopy_with_higher_orders():
     wave = jl.simulate(lidar, scene(0.6), key=jax.random.key(0), **planned)
 
     def estimates(density, reflectance):
-        fit = inversion.retrieve(wave, lidar, scene(density, reflectance), [factor, height], **options)
+        fit = ask(inversion.retrieve, wave, lidar, scene(density, reflectance), [factor, height], **options)
         return jnp.stack([fit.values["factor"], fit.values["height"]])
 
     # Leaf area is fitted: its factor is inversely proportional to the density that it multiplies.

@@ -16,6 +16,7 @@ from inversion.fit.model import ForwardModel
 from inversion.fit.planning import TraceSizes, corner_cases, plan_for_bounds
 from inversion.fit.unknowns import bind_unknowns, flat_start
 from jaxlidar.planning.plan_check import check_pulse, check_reach
+from tests.helpers import ask
 
 SLOPE = 20.0
 # It rises to the east.
@@ -89,7 +90,7 @@ def test_the_place_of_a_footprint_and_its_pulse_are_found():
         Unknown("lidar.pulse.fwhm", bounds=(3.0, 8.0), name="fwhm"),
     ]
     options = {"noise": noise, "time": TIME, "key": jax.random.key(2), **FIRST_ORDER}
-    fit = inversion.retrieve(observed, LIDAR, SCENE, unknowns, **options)
+    fit = ask(inversion.retrieve, observed, LIDAR, SCENE, unknowns, **options)
     assert fit.converged, fit.status
     for value, error, true_value in (
         (fit.values["position"][0], fit.stderr["position"][0], 1.5),
@@ -105,7 +106,7 @@ def test_a_slope_tells_how_far_up_it_a_footprint_lies():
     """The mean time of the return does, with the slope; along the contour nothing changes."""
     options: Any = {"noise": 1e-3, "key": jax.random.key(0), **FIRST_ORDER}
     position = Unknown("lidar.position", bounds=(-5.0, 5.0))
-    bound = inversion.cramer_rao(LIDAR, SCENE, [position], **options)
+    bound = ask(inversion.cramer_rao, None, LIDAR, SCENE, [position], **options)
     error = bound.stderr["lidar.position"]
     assert error[0] < 0.1
     assert not error[1] < 100 * error[0]
@@ -118,14 +119,14 @@ def test_a_bound_at_nadir_is_that_of_a_beam_beside_it():
     options: Any = {"noise": 1e-3, "key": jax.random.key(0), **FIRST_ORDER}
     zenith = Unknown("lidar.zenith", bounds=(0.0, 9.0))
     errors = [
-        float(inversion.cramer_rao(lidar, SCENE, [zenith], **options).stderr["lidar.zenith"])
+        float(ask(inversion.cramer_rao, None, lidar, SCENE, [zenith], **options).stderr["lidar.zenith"])
         for lidar in (nadir, dataclasses.replace(nadir, zenith=0.09))
     ]
     assert np.isfinite(errors[0])
     assert errors[0] == pytest.approx(errors[1], rel=0.01)
     plan = jl.plan(nadir, SCENE, max_orders=1, describe=False)
     with pytest.raises(ValueError, match="the plan does not fit: it is for a beam at nadir"):
-        inversion.cramer_rao(nadir, SCENE, [zenith], noise=1e-3, key=jax.random.key(0), plan=plan)
+        ask(inversion.cramer_rao, None, nadir, SCENE, [zenith], noise=1e-3, key=jax.random.key(0), plan=plan)
 
 
 @pytest.mark.slow
@@ -138,12 +139,14 @@ def test_posterior_and_profile_know_the_lidar():
         Unknown("ground.reflectance", bounds=(0.1, 0.6), name="reflectance"),
     ]
     options = {"noise": 0.01 * float(wave.reflectance.max()), "key": jax.random.key(2), **FIRST_ORDER}
-    density = inversion.log_density(wave, LIDAR, SCENE, unknowns, **options)
+    density = ask(inversion.log_density, wave, LIDAR, SCENE, unknowns, **options)
     gradient = np.asarray(jax.grad(density)(density.initial))
     step = 0.02 * np.eye(2)
     differences = [float(density(density.initial + h) - density(density.initial - h)) / 0.04 for h in step]
     np.testing.assert_allclose(gradient, differences, rtol=0.02)
-    profile = inversion.profile_likelihood(wave, LIDAR, SCENE, unknowns, "fwhm", [3.8, 4.0, 4.2], **options)
+    profile = ask(
+        inversion.profile_likelihood, wave, LIDAR, SCENE, unknowns, "fwhm", [3.8, 4.0, 4.2], **options
+    )
     assert int(np.argmin(profile.chi2)) == 1
     assert min(profile.chi2[0], profile.chi2[2]) > 10.0
 
@@ -158,7 +161,7 @@ def test_each_footprint_starts_from_its_own_lidar():
     unknown = Unknown("lidar.position", bounds=((-1.0, -1e-3), (22.0, 1e-3)), name="position")
     observed = np.stack([wave.reflectance for wave in waves])
     options = {"noise": 1e-3 * observed.max(), "time": TIME, "key": jax.random.key(3), **FIRST_ORDER}
-    fits = inversion.retrieve_many(observed, lidars, scene, [unknown], **options)
+    fits = ask(inversion.retrieve_many, observed, lidars, scene, [unknown], **options)
     np.testing.assert_allclose(fits.values["position"][:, 0], [0.4, 20.6], atol=0.05)
 
 
@@ -181,7 +184,7 @@ def test_a_plan_serves_all_lidars_within_the_bounds():
     options = {"noise": 0.01, "key": jax.random.key(0)}
     wave = waveform_of(nadir)
     with pytest.raises(ValueError, match="the plan does not fit: it is for a beam at nadir"):
-        inversion.retrieve(wave, nadir, SCENE, unknowns, plan=own, **options)
+        ask(inversion.retrieve, wave, nadir, SCENE, unknowns, plan=own, **options)
 
 
 def test_inadmissible_arrays_are_refused():

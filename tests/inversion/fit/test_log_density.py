@@ -13,6 +13,7 @@ import inversion
 import jaxlidar as jl
 from inversion import LogNormal, Smooth, Unknown
 from inversion.fit.recorder_model import RecorderModel
+from tests.helpers import ask
 
 LIDAR = jl.Lidar(altitude=500.0, divergence=4.0, pulse=jl.GaussianPulse(fwhm=4.0))
 WINDOW = (-40.0, 20.0)
@@ -52,8 +53,8 @@ def test_the_posterior_of_a_linear_unknown_is_the_gaussian_of_the_fit(prior):
     unknown = Unknown("ground.reflectance", bounds=(0.0, 1.0), name="reflectance", prior=prior)
     arguments = observed, LIDAR, ground(reflectance=0.5), [unknown]
     options = {"noise": 0.005, "time": time, "key": jax.random.key(1)}
-    fit = inversion.retrieve(*arguments, **options)
-    density = inversion.log_density(*arguments, **options)
+    fit = ask(inversion.retrieve, *arguments, **options)
+    density = ask(inversion.log_density, *arguments, **options)
     estimate, stderr = float(fit.values["reflectance"]), float(fit.stderr["reflectance"])
     mean, std = moments(density, density.to_natural, "reflectance")
     assert abs(mean - estimate) < 0.015 * stderr
@@ -72,7 +73,7 @@ def test_a_log_normal_prior_is_a_density_of_the_unknown_itself():
     unknown = Unknown("ground.reflectance", bounds=(0.0, 1.0), prior=LogNormal(0.3, 0.2), name="reflectance")
     # So noisy that the prior alone remains.
     options = {"noise": 100.0, "time": time, "key": jax.random.key(1)}
-    density = inversion.log_density(observed, LIDAR, ground(), [unknown], **options)
+    density = ask(inversion.log_density, observed, LIDAR, ground(), [unknown], **options)
     mean, std = moments(density, density.to_natural, "reflectance", -8.0, 8.0)
     prior = stats.lognorm(s=0.2, scale=0.3)
     assert mean == pytest.approx(prior.mean(), rel=2e-3)
@@ -85,7 +86,7 @@ def test_noise_of_a_recorder_is_normalised_where_it_grows_with_the_scale():
     recorder = inversion.Recorder(offset=(-0.1, 0.1), interleaved=2, pulse_noise=0.05, correlation=0.5)
     options = {"noise": 0.01, "time": time, "key": jax.random.key(1), "recorder": recorder}
     height = Unknown("ground.height", bounds=(-1.0, 1.0), name="height")
-    density = inversion.log_density(observed, LIDAR, ground(), [height], scale=(0.1, 10.0), **options)
+    density = ask(inversion.log_density, observed, LIDAR, ground(), [height], scale=(0.1, 10.0), **options)
     assert density.names == ("height", "offset[0]", "offset[1]", "scale")
     values = density.to_natural(density.initial)
     differences = []
@@ -123,7 +124,7 @@ def stand_density():
         Unknown("canopy.leaf.reflectance", bounds=(0.1, 0.6), name="leaf", prior=LogNormal(0.45, 0.1)),
     ]
     options = {"noise": 2e-4, "time": time, "key": jax.random.key(1), "max_orders": 1, "n_rays": 64}
-    return inversion.log_density(observed, LIDAR, stand((0.2, 0.2, 0.2), 0.1), unknowns, **options)
+    return ask(inversion.log_density, observed, LIDAR, stand((0.2, 0.2, 0.2), 0.1), unknowns, **options)
 
 
 @pytest.mark.slow
@@ -169,7 +170,7 @@ def test_a_scene_out_of_range_has_no_density():
     # Leaves of a transmittance of 0.4 reflect 0.6 at most.
     unknown = Unknown("canopy.leaf.reflectance", bounds=(0.1, 0.9), name="leaf")
     options = {"noise": 1e-3, "time": time, "key": jax.random.key(1), "max_orders": 1, "n_rays": 64}
-    density = inversion.log_density(observed, LIDAR, stand(), [unknown], **options)
+    density = ask(inversion.log_density, observed, LIDAR, stand(), [unknown], **options)
     assert np.isfinite(density(density.initial))
     value, gradient = jax.value_and_grad(density)(density.to_unconstrained({"leaf": 0.8}))
     assert float(value) == -np.inf
@@ -188,7 +189,7 @@ def test_a_scene_that_the_plan_does_not_reach_has_no_density(scene):
     # The plan serves the start and both bounds; between them the ground rises above the start of its rays.
     unknown = Unknown(apply=bulge, bounds=(0.0, 1.0), start=0.01, name="bulge")
     options = {"noise": 1e-3, "time": time, "key": jax.random.key(1), "max_orders": 1, "n_rays": 64}
-    density = inversion.log_density(observed, LIDAR, scene, [unknown], **options)
+    density = ask(inversion.log_density, observed, LIDAR, scene, [unknown], **options)
     x = density.to_unconstrained({"bulge": np.array([0.01, 0.5, 0.99])})
     values, gradients = jax.vmap(jax.value_and_grad(density))(x)
     assert np.isfinite(values).tolist() == [True, False, True]
@@ -206,7 +207,7 @@ def test_optics_brighter_than_the_start_have_a_density():
         Unknown("ground.height", bounds=(-1.0, 1.0), name="height"),
     ]
     options = {"noise": 1e-3, "time": time, "key": jax.random.key(1), "n_photons": 64, "n_rays": 64}
-    density = inversion.log_density(observed, LIDAR, stand(), unknowns, **options)
+    density = ask(inversion.log_density, observed, LIDAR, stand(), unknowns, **options)
     corners = density.to_unconstrained({"leaf": np.array([0.059, 0.59]), "height": np.array([-0.99, 0.99])})
     assert np.all(np.isfinite(jax.vmap(density)(corners)))
 
@@ -215,8 +216,15 @@ def test_a_smoothness_prior_without_strength_is_refused():
     observed, time = noisy_record(stand(), 1e-3)
     unknown = Unknown("canopy.voxels.leaf", bounds=(0.0, 1.0), prior=Smooth(scale=2.0))
     with pytest.raises(ValueError, match="strength = None"):
-        inversion.log_density(
-            observed, LIDAR, stand(), [unknown], noise=1.0, time=time, key=jax.random.key(0)
+        ask(
+            inversion.log_density,
+            observed,
+            LIDAR,
+            stand(),
+            [unknown],
+            noise=1.0,
+            time=time,
+            key=jax.random.key(0),
         )
 
 
@@ -225,7 +233,7 @@ def test_covariances_are_those_of_draws():
     observed, time = noisy_record(ground(), 0.01)
     unknowns = [Unknown("ground.height", bounds=(-1.0, 1.0), name="height"), REFLECTANCE]
     options = {"noise": 0.01, "time": time, "key": jax.random.key(1)}
-    density = inversion.log_density(observed, LIDAR, ground(), unknowns, **options)
+    density = ask(inversion.log_density, observed, LIDAR, ground(), unknowns, **options)
     values = {"height": 0.99, "reflectance": 0.3}
     covariance = np.array([[1e-8, 3e-7], [3e-7, 4e-5]])
     with jax.enable_x64(True):
@@ -253,7 +261,7 @@ def test_inadmissible_covariances_are_refused(covariance, message):
     observed, time = noisy_record(ground(), 0.01)
     unknowns = [Unknown("ground.height", bounds=(-1.0, 1.0), name="height"), REFLECTANCE]
     options = {"noise": 0.01, "time": time, "key": jax.random.key(1)}
-    density = inversion.log_density(observed, LIDAR, ground(), unknowns, **options)
+    density = ask(inversion.log_density, observed, LIDAR, ground(), unknowns, **options)
     with pytest.raises(ValueError, match=message):
         density.to_unconstrained_covariance(covariance, {"height": 0.0, "reflectance": 0.3})
 
@@ -265,7 +273,10 @@ def test_samplers_draw_from_the_posterior(package):
     unknowns = [Unknown("ground.height", bounds=(-1.0, 1.0), name="height"), REFLECTANCE]
     arguments = observed, LIDAR, ground(height=0.0), unknowns
     options = {"noise": 0.01, "time": time, "key": jax.random.key(1)}
-    fit, density = inversion.retrieve(*arguments, **options), inversion.log_density(*arguments, **options)
+    fit, density = (
+        ask(inversion.retrieve, *arguments, **options),
+        ask(inversion.log_density, *arguments, **options),
+    )
     key = jax.random.key(2)
     if package == "blackjax":
         adaptation = sampler.window_adaptation(sampler.nuts, density)

@@ -6,6 +6,7 @@ import pytest
 
 import inversion
 import jaxlidar as jl
+from tests.helpers import ask
 
 CASES, LAYERS = 200, 4
 ANGLES = ("planophile", "erectophile")
@@ -69,7 +70,8 @@ def test_robust_errors_cover_the_ground_of_a_wrong_model():
         record = np.asarray(wave.reflectance)
         records.append(record + 0.01 * record.max() * random.normal(size=record.shape))
     records = np.stack(records)
-    fits = inversion.retrieve_many(
+    fits = ask(
+        inversion.retrieve_many,
         records,
         lidar(transmitted_pulse()),
         model,

@@ -12,6 +12,7 @@ import inversion
 import jaxlidar as jl
 from inversion import LogNormal, Unknown
 from inversion.fit.unknowns import bind_unknowns
+from tests.helpers import ask
 from tests.quick_compilation import optimise_programs
 
 SCENE = jl.Scene(
@@ -82,7 +83,7 @@ def test_unknowns_can_be_pickled():
 
 def retrieve(observed, unknowns):
     scene = jl.Scene(ground=jl.Ground(height=0.0, reflectance=0.5))
-    return inversion.retrieve(observed, jl.Lidar(), scene, unknowns, noise=1e-3, key=jax.random.key(1))
+    return ask(inversion.retrieve, observed, jl.Lidar(), scene, unknowns, noise=1e-3, key=jax.random.key(1))
 
 
 @pytest.mark.slow

@@ -10,17 +10,17 @@ import jaxlidar as jl
 from inversion.fit.data import ObservedWaveform
 from inversion.fit.model import PILOT_BATCHES, Evaluation, ForwardModel
 from inversion.fit.planning import TraceSizes, plan_for_bounds
+from inversion.fit.problem import BoundProblem
 from inversion.fit.recorder_model import RecorderModel
-from inversion.fit.retrieval_many import LockstepGroups, LockstepModel, ManyFits
+from inversion.fit.retrieval_many import LockstepGroups, LockstepModel
 from inversion.fit.solver import (
-    DEFAULT_SOLVER,
     EvaluationRequest,
     LeastSquaresFit,
     SolverSettings,
-    run_fit,
 )
 from inversion.fit.unknowns import BoundUnknown, Setter, bind_unknowns
 from jaxlidar.planning.plan import MIN_BATCHES
+from tests.helpers import run_fit
 from tests.inversion.fit.test_retrieval import LIDAR, UNKNOWNS, retrieve_canopy, start_scene, target  # noqa: F401
 
 # Two echoes of unknown heights and strengths, and of a common unknown width.
@@ -74,7 +74,7 @@ def fit_echoes(simulation, seed, max_steps=50, progress=None):
     ]
     observation = ObservedWaveform(TIME, observed, np.full(observed.shape, SIGMA))
     recorder = RecorderModel(None, [], jl.Lidar(), TIME.size)
-    settings = SolverSettings(DEFAULT_SOLVER, max_steps, starts=1)
+    settings = SolverSettings(max_steps, starts=1)
     return run_fit(LeastSquaresFit(observation, unknowns, recorder, settings, progress).run(), simulation)
 
 
@@ -141,7 +141,7 @@ def model_and_lockstep_model():
     unknowns = bind_unknowns(UNKNOWNS[1:4:2], scene)
     plan = plan_for_bounds(LIDAR, scene, unknowns, time, TraceSizes(128, 64, max_orders=2))
     key = jax.random.key(0)
-    problem = ManyFits(
+    problem = BoundProblem(
         numbers=range(3),
         observed=[],
         lidars=[LIDAR],
@@ -150,10 +150,9 @@ def model_and_lockstep_model():
         scale=[],
         recorders=[None],
         plan=plan,
-        settings=SolverSettings(DEFAULT_SOLVER, max_steps=1, starts=1),
-        groups=LockstepGroups(n_threads=2, fits_per_thread=2),
     )
-    return ForwardModel(LIDAR, scene, plan, unknowns, key), LockstepModel(problem, key)
+    groups = LockstepGroups(n_threads=2, fits_per_thread=2)
+    return ForwardModel(LIDAR, scene, plan, unknowns, key), LockstepModel(problem, groups, key)
 
 
 @pytest.fixture

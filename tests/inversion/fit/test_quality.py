@@ -14,7 +14,7 @@ from inversion import Verdict, judge_fit, judge_record
 from inversion.fit.data import ObservedWaveform
 from inversion.fit.model import Evaluation
 from inversion.fit.recorder_model import RecorderModel
-from inversion.fit.solver import DEFAULT_SOLVER, LeastSquaresFit, SolverSettings, multistart, run_fit
+from inversion.fit.solver import LeastSquaresFit, SolverSettings, multistart
 from inversion.fit.uncertainty import (
     SampleIndex,
     _autoregressive_products,
@@ -24,6 +24,7 @@ from inversion.fit.uncertainty import (
     residual_covariance,
 )
 from inversion.fit.unknowns import BoundUnknown, Setter
+from tests.helpers import ask, run_fit
 
 BIN = np.arange(600)
 PULSE = np.exp(-0.5 * (np.arange(-40.0, 41.0) / 6.0) ** 2)
@@ -237,9 +238,15 @@ def test_one_fit_and_many_give_the_same_evidence():
     ]
     options = {"noise": 0.001, "starts": 2, "key": jax.random.key(1)}
     start = jl.Scene(ground=jl.Ground())
-    fit = inversion.retrieve(wave, jl.Lidar(), start, unknowns, **options)
-    fits = inversion.retrieve_many(
-        wave.reflectance[None], jl.Lidar(), start, unknowns, time=wave.time, **options
+    fit = ask(inversion.retrieve, wave, jl.Lidar(), start, unknowns, **options)
+    fits = ask(
+        inversion.retrieve_many,
+        wave.reflectance[None],
+        jl.Lidar(),
+        start,
+        unknowns,
+        time=wave.time,
+        **options,
     )
     for name in fit.values:
         assert fit.robust_stderr[name] >= fit.stderr[name]
@@ -267,7 +274,7 @@ def test_starts_that_end_elsewhere_at_the_same_misfit_are_doubt():
         inversion.Unknown("ground.reflectance", bounds=(0.05, 0.9), name="reflectance"),
     ]
     options = {"noise": 1e-4, "starts": 3, "key": jax.random.key(1)}
-    fit = inversion.retrieve(wave, lidar, scene(40.0), unknowns, **options)
+    fit = ask(inversion.retrieve, wave, lidar, scene(40.0), unknowns, **options)
     assert fit.converged
     assert min(abs(float(fit.values["slope"]) - slope) for slope in (10.0, 30.0)) < 0.1
     assert fit.quality.quality == "doubtful"
@@ -308,7 +315,7 @@ def fit_from_two_starts(batch_sigma, max_steps_elsewhere=50):
             observation,
             [unknown],
             recorder,
-            SolverSettings(DEFAULT_SOLVER, steps, 2),
+            SolverSettings(steps, 2),
             start=np.array([start]),
         )
         for start, steps in ((0.7, 50), (-0.7, max_steps_elsewhere))

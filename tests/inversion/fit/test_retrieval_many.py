@@ -12,7 +12,7 @@ import pytest
 import inversion
 import jaxlidar as jl
 from inversion import Unknown
-from tests.helpers import slow_unless
+from tests.helpers import ask, slow_unless
 from tests.survey.test_simulate_many import Dying
 
 LIDAR = jl.Lidar(wavelength=(532.0, 1064.0), pulse=jl.GaussianPulse(fwhm=4.0))
@@ -46,7 +46,7 @@ def footprints():
 def fit(footprints, lidar=LIDAR, scene=START, unknowns=UNKNOWNS, **options):
     observed, noise, time = footprints
     options = {"noise": noise, "time": time, "key": jax.random.key(1), "lanes": 6, **options}
-    return inversion.retrieve_many(observed, lidar, scene, unknowns, **options)
+    return ask(inversion.retrieve_many, observed, lidar, scene, unknowns, **options)
 
 
 @pytest.mark.slow
@@ -102,8 +102,15 @@ def test_many_fits_are_the_single_fits(footprints):
     observed, noise, time = footprints
     fits = fit(footprints)
     for i in (0, 7, COUNT - 1):
-        single = inversion.retrieve(
-            observed[i], LIDAR, START, UNKNOWNS, noise=noise, time=time, key=jax.random.key(1)
+        single = ask(
+            inversion.retrieve,
+            observed[i],
+            LIDAR,
+            START,
+            UNKNOWNS,
+            noise=noise,
+            time=time,
+            key=jax.random.key(1),
         )
         for name in TRUTH:
             assert np.allclose(fits.values[name][i], single.values[name], rtol=1e-4, atol=1e-5)
@@ -168,7 +175,7 @@ def test_several_starts_find_a_minimum_that_one_start_misses(footprints):
     observed, noise, time = footprints
     far_start = jl.Scene(ground=jl.Ground(height=-1.9, reflectance=np.array([0.3, 0.3])))
     options = {"noise": noise, "time": time, "key": jax.random.key(1), "starts": 8}
-    fits = inversion.retrieve_many(observed[-2:], LIDAR, far_start, UNKNOWNS, **options)
+    fits = ask(inversion.retrieve_many, observed[-2:], LIDAR, far_start, UNKNOWNS, **options)
     assert np.all(fits.converged)
     assert np.allclose(fits.values["height"], TRUTH["height"][-2:], atol=0.05)
     assert all("of 8 starts ended there" in s for s in fits.status)
@@ -186,7 +193,7 @@ def test_results_go_to_xarray(footprints):
 def test_inadmissible_records_are_refused(footprints):
     observed, noise, time = footprints
     for change, message in (
-        ((observed[0], noise, time), "observed has the shape"),
+        ((observed[0], noise, time), "observed is one record"),
         ((observed, np.ones(3), time), "noise has the shape"),
         ((observed, -1.0, time), "noise = -1"),
         ((observed, noise, time[:-1]), "observed has the shape"),
@@ -222,6 +229,7 @@ def test_inadmissible_arguments_are_refused(footprints, change, message):
 WRONG_TYPES = """
 import jax, numpy as np, inversion, jaxlidar as jl
 from inversion import Unknown
+from tests.helpers import ask
 lidar, scene = jl.Lidar(), jl.Scene(ground=jl.Ground())
 arguments = {
     "observed": np.ones((1, 1, 9)), "lidar": lidar, "scene": scene,
@@ -229,22 +237,21 @@ arguments = {
     "noise": 1.0, "time": np.arange(-4.0, 5.0), "key": jax.random.key(0),
 }
 def fit_many(**changes):
-    inversion.retrieve_many(**arguments | changes)
+    ask(inversion.retrieve_many, **arguments | changes)
 def fit_one(**changes):
-    inversion.retrieve(**arguments | {"observed": np.ones((1, 9))} | changes)
+    ask(inversion.retrieve, **arguments | {"observed": np.ones((1, 9))} | changes)
 def profile(**changes):
     two_unknowns = [*arguments["unknowns"], Unknown("ground.reflectance", bounds=(0.0, 1.0))]
     named = {"name": "ground.height", "values": [0.0, 0.1], "unknowns": two_unknowns}
-    inversion.profile_likelihood(**arguments | {"observed": np.ones((1, 9))} | named | changes)
+    ask(inversion.profile_likelihood, **arguments | {"observed": np.ones((1, 9))} | named | changes)
 def bound(**changes):
-    inversion.cramer_rao(**{k: v for k, v in arguments.items() if k != "observed"} | changes)
+    ask(inversion.cramer_rao, **arguments | {"observed": None} | changes)
 for call in (
     lambda: fit_many(observed="all"),
     lambda: fit_many(observed=None),
     lambda: fit_many(noise="low"),
     lambda: fit_many(time=None),
     lambda: fit_many(key=3),
-    lambda: fit_many(solver=None),
     lambda: fit_many(lidar=scene),
     lambda: fit_many(scene=[lidar]),
     lambda: fit_many(unknowns=arguments["unknowns"][0]),
@@ -258,7 +265,6 @@ for call in (
     lambda: fit_one(observed="all"),
     lambda: fit_one(progress=3),
     lambda: fit_one(unknowns=arguments["unknowns"][0]),
-    lambda: fit_one(solver=None),
     lambda: fit_one(max_steps=None),
     lambda: bound(unknowns=iter(arguments["unknowns"])),
     lambda: bound(noise=None),
@@ -266,7 +272,6 @@ for call in (
     lambda: fit_one(scene=lidar),
     lambda: fit_one(plan="p"),
     lambda: bound(key=None),
-    lambda: profile(solver=None),
     lambda: profile(key=0),
     lambda: profile(values="all"),
     lambda: profile(steps=9),
@@ -275,6 +280,7 @@ for call in (
     lambda: profile(scale=2.0),
     lambda: profile(progress=3),
     lambda: profile(noise=[1.0, 2.0]),
+    lambda: inversion.retrieve(arguments["observed"], key=arguments["key"]),
     lambda: Unknown(3, bounds=(0.0, 1.0)),
     lambda: Unknown(apply=3, name="x", start=0.5, bounds=(0.0, 1.0)),
 ):
@@ -291,12 +297,11 @@ def test_arguments_of_the_wrong_type_are_refused():
     process = subprocess.run([sys.executable, "-c", WRONG_TYPES], check=True, capture_output=True, text=True)
     assert process.stdout.splitlines() == [
         "TypeError observed is a str; admissible are real numbers",
-        "TypeError observed is None; admissible are real numbers",
+        "ValueError problem has observed = None; admissible with it is cramer_rao alone",
         "TypeError noise is a str; admissible are real numbers",
         "ValueError time = None, but observed is an array: its sample times are needed",
         "TypeError key is an int; admissible is a JAX random key, as jax.random.key(0) makes it",
-        "ValueError solver = None is no Gauss-Newton method of optimistix",
-        "TypeError lidar is a Scene; admissible is one Lidar, or a sequence of one for each footprint",
+        "TypeError lidar is a Scene; admissible is one Lidar, or a sequence of one for each record",
         "TypeError scene 0 is a Lidar; admissible is a Scene",
         "TypeError unknowns is an Unknown; admissible is a sequence of Unknown",
         "TypeError unknowns[0] is a str; admissible is an Unknown",
@@ -309,7 +314,6 @@ def test_arguments_of_the_wrong_type_are_refused():
         "TypeError observed is a str; admissible are real numbers",
         "TypeError progress = 3 is no function",
         "TypeError unknowns is an Unknown; admissible is a sequence of Unknown",
-        "ValueError solver = None is no Gauss-Newton method of optimistix",
         "TypeError max_steps is None; admissible is an integer of at least 1",
         "TypeError unknowns is a list_iterator; admissible is a sequence of Unknown",
         "TypeError noise is None; admissible are real numbers",
@@ -317,15 +321,15 @@ def test_arguments_of_the_wrong_type_are_refused():
         "TypeError scene is a Lidar; admissible is a Scene",
         "TypeError plan is a str; admissible is a Plan",
         "TypeError key is None; admissible is a JAX random key, as jax.random.key(0) makes it",
-        "ValueError solver = None is no Gauss-Newton method of optimistix",
         "TypeError key is an int; admissible is a JAX random key, as jax.random.key(0) makes it",
         "TypeError values is a str; admissible are real numbers",
-        "TypeError got an unexpected keyword argument 'steps'",
+        "TypeError profile_likelihood() got an unexpected keyword argument 'steps'",
         "ValueError max_steps = 0 is outside the admissible range [1, inf) of integers",
         "ValueError starts = 1.5 is outside the admissible range [1, inf) of integers",
         "ValueError scale = 2.0 is not a pair (low, high)",
         "TypeError progress = 3 is no function",
         "ValueError noise has the shape (2,), which does not broadcast to (1, 9)",
+        "TypeError problem is an array of float64; admissible is an inversion.Problem",
         "TypeError an unknown: where = 3 is no path and no function",
         "TypeError unknown 'x': apply = 3 is no function",
     ]

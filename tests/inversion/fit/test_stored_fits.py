@@ -16,6 +16,7 @@ import jaxlidar as jl
 from inversion.fit.fit_summary import FitSummary
 from inversion.fit.retrieval_many import FinishedFits
 from jaxlidar.io.store import StoredRows, open_store
+from tests.helpers import ask
 from tests.inversion.fit.test_fingerprint import PROBLEM, TIME, unknowns
 from tests.io.test_store import UNWRITABLE, flip_a_bit, unwritable
 
@@ -62,7 +63,7 @@ def test_a_path_that_cannot_be_written_is_refused_before_the_work(tmp_path, monk
         "inversion.fit.retrieval_many.LockstepModel", lambda *_: pytest.fail("the work began")
     )
     with pytest.raises(OSError, match=r"path = .* cannot be written: "):
-        inversion.retrieve_many(**PROBLEM | {"path": unwritable(kind, tmp_path)})
+        ask(inversion.retrieve_many, **PROBLEM | {"path": unwritable(kind, tmp_path)})
 
 
 COUNT = 7
@@ -78,7 +79,8 @@ def echoes():
 
 def run(path, progress=None):
     """Fit flat ground, which is simulated quickly. Another process calls this too."""
-    return inversion.retrieve_many(
+    return ask(
+        inversion.retrieve_many,
         echoes(),
         jl.Lidar(),
         jl.Scene(ground=jl.Ground(reflectance=0.3)),

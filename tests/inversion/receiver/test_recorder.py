@@ -11,6 +11,7 @@ import jaxlidar as jl
 from inversion import Recorder, Unknown
 from inversion.fit.recorder_model import RecorderModel
 from inversion.fit.retrieval import scale_unknown
+from tests.helpers import ask
 
 TIME = np.arange(-40.0, 61.0)
 HEIGHT = Unknown("ground.height", bounds=(-2.0, 2.0), name="height")
@@ -44,7 +45,8 @@ def fits_of(records, pulses, noise, recorder, near=0.0, path=None):
     """Fits of records that start 0.05 m above the heights `near`."""
     lidars = [jl.Lidar(pulse=pulse) for pulse in pulses]
     settings = {"scale": (0.01, 1e3), "key": jax.random.key(0), "time": TIME, "plan": plan_of(pulses[0])}
-    return inversion.retrieve_many(
+    return ask(
+        inversion.retrieve_many,
         records[:, None],
         lidars if len(lidars) > 1 else lidars[0],
         START,
@@ -175,7 +177,7 @@ def test_a_range_offset_is_retrieved_with_its_error():
         options = {"recorder": recorder, "scale": (1.0, 30.0), **settings}
         # The gain and the reflectance are one factor: a prior settles it.
         unknown = dataclasses.replace(brightness, prior=(0.5, 0.05))
-        return inversion.retrieve_many(records[:, None], lidar, scene, [unknown], **options)
+        return ask(inversion.retrieve_many, records[:, None], lidar, scene, [unknown], **options)
 
     fits = fits_with(Recorder(delay=(-8.0, 8.0)))
     assert fits.labels == ("brightness", "delay", "scale")
@@ -208,7 +210,8 @@ def test_one_fit_is_that_of_a_batch(interleaved):
     recorder = Recorder(width=(0.2, 5.0), offset=(-1.0, 1.0), interleaved=2, pulse_noise=0.005)
     batch = fits_of(records[:1], [pulse], 0.01, recorder, height[0])
     settings = {"time": TIME, "plan": plan_of(pulse), "key": jax.random.fold_in(jax.random.key(0), 0)}
-    single = inversion.retrieve(
+    single = ask(
+        inversion.retrieve,
         records[0],
         jl.Lidar(pulse=pulse),
         jl.Scene(ground=jl.Ground(height=float(height[0]) + 0.05, reflectance=0.5)),
@@ -350,7 +353,8 @@ def test_other_bad_input_is_refused():
         inversion.recorded_pulse([0.0, 1.0, 3.0], [0.0, 1.0, 0.0])
     offset = Unknown("ground.height", bounds=(-2.0, 2.0), name="offset")
     with pytest.raises(ValueError, match="taken by the recorder"):
-        inversion.retrieve(
+        ask(
+            inversion.retrieve,
             np.zeros(TIME.size),
             jl.Lidar(),
             START,
