@@ -30,7 +30,7 @@ from jaxtyping import Array, PRNGKeyArray
 from inversion.fit.fit_summary import FitSummary
 from inversion.fit.model import Evaluation, ForwardModel, SimulationInputs, evaluate_scene
 from inversion.fit.planning import trace_sizes
-from inversion.fit.problem import BoundProblem, Problem
+from inversion.fit.problem import BoundProblem, Problem, check_problem
 from inversion.fit.result import Retrievals, retrievals_of
 from inversion.fit.retrieval import check_progress, solver_settings
 from inversion.fit.solver import (
