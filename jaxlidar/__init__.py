@@ -64,10 +64,6 @@ waveforms is in the package `inversion`.
 
 `compilation_cache`, `CompilationCache`.
 
-## Paths as the paper traces them
-
-`analog_returns`, `AnalogReturns`, `photon_paths`.
-
 ## Warnings and constants
 
 `LateLightWarning`, `UnfollowedLightWarning`, `MisplacedCanopyWarning`, `LostWorkersWarning`, `OffMapWarning`,
@@ -89,7 +85,6 @@ from jaxlidar._fingerprint import version_of
 from jaxlidar._progress import Progress, TaskProgress
 from jaxlidar._registry import register_public_objects, waveform_html
 from jaxlidar._workers import LostWorkersWarning
-from jaxlidar.analog import AnalogReturns, analog_returns, photon_paths
 from jaxlidar.energy import EnergyBudget, energy_budget
 from jaxlidar.instrument.catalogue import InstrumentValue, instrument, instrument_sources, instruments
 from jaxlidar.instrument.lidar import Lidar
@@ -287,9 +282,6 @@ __all__ = [
     "compilation_cache",
     "CompilationCache",
     # Paths as the paper traces them.
-    "analog_returns",
-    "AnalogReturns",
-    "photon_paths",
     # Warnings and constants.
     "LateLightWarning",
     "UnfollowedLightWarning",

@@ -18,7 +18,6 @@ LONG_EXAMPLES = {
     "inversion.scene.geolocation.geolocate",
     "inversion.scene.retrieval.retrieve_scene",
     "inversion.scene.scene_retrieval.SceneRetrieval",
-    "jaxlidar.analog.photon_paths",
     "jaxlidar.energy.energy_budget",
     "jaxlidar.passive.ReflectanceFactor",
     "jaxlidar.passive.plan_reflectance",

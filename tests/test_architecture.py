@@ -44,7 +44,6 @@ LAYERS = (
     "scene_batch",
     "passive",
     "energy",
-    "analog",
     "io",
     "survey",
     "plot",

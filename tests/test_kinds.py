@@ -159,8 +159,6 @@ CALLS = {
     "reduce": lambda l, s, k: jl.make_setup(l, s, plan),
     "energy_budget": lambda l, s, k: jl.energy_budget(l, s, key=k),
     "trace_scene": lambda l, s, k: jl.trace_scene(jl.make_setup(l, s, plan), k),
-    "analog_returns": lambda l, s, k: jl.analog_returns(l, s, plan, key=k, n_photons=10),
-    "photon_paths": lambda l, s, k: jl.photon_paths(l, s, plan, key=k, n_photons=10),
     "retrieve": lambda l, s, k: inversion.retrieve(problem(y, l, s), key=k),
     "retrieve_many": lambda l, s, k: inversion.retrieve_many(problem(y[None], l, s), key=k),
     "cramer_rao": lambda l, s, k: inversion.cramer_rao(problem(None, l, s), key=k),

@@ -15,9 +15,11 @@ order or on the ground, where no other error hides theirs, against the finest va
 
 import dataclasses
 import os
+import runpy
 import time
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 
 import equinox as eqx
 import jax
@@ -26,6 +28,8 @@ from _common import machine, options, plt, print_table, save_figure, write_json
 
 import jaxlidar as jl
 
+# The estimator of the paper.
+ANALOG = runpy.run_path(str(Path(__file__).resolve().parents[1] / "paper" / "_analog.py"))
 LIDAR = jl.Lidar(wavelength=1064.0, divergence=5.0)
 CONE = 10.0
 TARGETS = (0.1, 0.01, 0.001)
@@ -128,7 +132,7 @@ def run_analog(case: AccuracyCase, photons: int, groups: int) -> BatchRun:
     kernel = upper - lower
 
     def group(number):
-        returns = jl.analog_returns(
+        returns = ANALOG["analog_returns"](
             LIDAR, case.scene, plan, key=jax.random.key(number), n_photons=photons, cone=CONE
         )
         counts, _ = np.histogram(returns.time, edges, weights=np.asarray(returns.weight[0], float))

@@ -7,6 +7,7 @@ from pathlib import Path
 import jax
 import matplotlib
 import numpy as np
+from _analog import analog_returns
 
 import jaxlidar as jl
 from jaxlidar.io import atomic_write
@@ -99,7 +100,7 @@ def send_pulses(
     energy = np.diff(np.asarray(lidar.pulse.cumulative(jax.numpy.asarray(edges), float(lidar.jitter))))
     strong = energy > 1e-3 * energy.max()
     sent, energy = (0.5 * (edges[:-1] + edges[1:]))[strong], energy[strong]
-    returns = jl.analog_returns(
+    returns = analog_returns(
         lidar, scene, plan, key=jax.random.key(seed), n_photons=pulses * sent.size, cone=CONE
     )
     shape = (pulses, sent.size)

@@ -5,6 +5,7 @@ python examples/paper/figure_07.py [--out figures] [--small]
 
 import jax
 import numpy as np
+from _analog import photon_paths
 from _common import COLOURS, new_figure, options, save, tree_scene
 
 import jaxlidar as jl
@@ -17,7 +18,7 @@ def main(argv=None) -> dict[str, float]:
     scene = tree_scene(1.0 if arguments.small else 0.25)
     plan = jl.plan(lidar, scene, max_orders=2 if arguments.small else 8)
     wave = jl.simulate(lidar, scene, key=jax.random.key(0), plan=plan, n_photons=8 * 1024)
-    points = jl.photon_paths(lidar, scene, plan, key=jax.random.key(3), n_photons=60, leaving=3.0)
+    points = photon_paths(lidar, scene, plan, key=jax.random.key(3), n_photons=60, leaving=3.0)
     points = np.asarray(points, float)
     has_moved = np.any(np.diff(points, axis=1) != 0, axis=2)
     collisions = has_moved.sum(axis=1) - 1

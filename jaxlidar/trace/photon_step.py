@@ -1,7 +1,7 @@
 """One step of photons, in the parts that all estimators share: fly, pass plates, collide.
 
-The response (`jaxlidar.trace.higher_orders`), absorption (`jaxlidar.trace.absorption`) and the analog
-estimator (`jaxlidar.analog`) follow photons in the same way, and differ in what they add to a tally on the
+The response (`jaxlidar.trace.higher_orders`), absorption (`jaxlidar.trace.absorption`) and the estimator of
+the paper (`examples/paper`) follow photons in the same way, and differ in what they add to a tally on the
 way:
 
 1. `meet_surfaces` and `sample_flights` say where a flight ends (`jaxlidar.trace.flight`); `fly_once` is both,

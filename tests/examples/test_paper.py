@@ -14,7 +14,8 @@ SCRIPTS = sorted(p.stem for p in FOLDER.glob("*.py") if not p.stem.startswith("_
 def script(monkeypatch):
     """Return a function that imports a script as `python examples/paper/name.py` would."""
     monkeypatch.syspath_prepend(str(FOLDER))
-    monkeypatch.delitem(sys.modules, "_common", raising=False)
+    for name in ("_common", "_analog"):
+        monkeypatch.delitem(sys.modules, name, raising=False)
 
     def load(name):
         spec = importlib.util.spec_from_file_location(f"paper_{name}", FOLDER / f"{name}.py")
@@ -23,7 +24,8 @@ def script(monkeypatch):
         return module
 
     yield load
-    sys.modules.pop("_common", None)
+    for name in ("_common", "_analog"):
+        sys.modules.pop(name, None)
 
 
 LONG = ("introduction", *(f"figure_{n:02}" for n in (1, 5, 6, 7, 8, 9, 12)), "figures_13_14")

@@ -1,11 +1,19 @@
 """The analog estimator of the paper, against the closed form and against `simulate`."""
 
+import importlib.util
+from pathlib import Path
+
 import jax
 import numpy as np
 import pytest
 
 import jaxlidar as jl
 from tests.helpers import agrees, slab, slow_unless
+
+PATH = Path(__file__).resolve().parents[2] / "examples" / "paper" / "_analog.py"
+spec = importlib.util.spec_from_file_location("paper_analog", PATH)
+analog = importlib.util.module_from_spec(spec)
+spec.loader.exec_module(analog)
 
 LIDAR = jl.Lidar(altitude=1000.0, divergence=1.0)
 CONE = 8.0
@@ -14,7 +22,9 @@ CONE = 8.0
 def total(lidar, scene, n_photons, *, seed=0, cone=CONE, **planned):
     """Return mean and standard error of the apparent reflectance, by independent photons."""
     plan = jl.plan(lidar, scene, **planned)
-    returns = jl.analog_returns(lidar, scene, plan, key=jax.random.key(seed), n_photons=n_photons, cone=cone)
+    returns = analog.analog_returns(
+        lidar, scene, plan, key=jax.random.key(seed), n_photons=n_photons, cone=cone
+    )
     weight = np.asarray(returns.weight, float)
     assert np.all(np.isfinite(weight))
     assert np.all(np.isfinite(returns.time))
@@ -47,7 +57,7 @@ def test_a_level_lambertian_ground_returns_its_reflectance():
 def test_returns_arrive_at_the_two_way_travel_time():
     scene = jl.Scene(ground=jl.Ground(height=-3.0, reflectance=0.5))
     plan = jl.plan(LIDAR, scene)
-    returns = jl.analog_returns(LIDAR, scene, plan, key=jax.random.key(0), n_photons=2000)
+    returns = analog.analog_returns(LIDAR, scene, plan, key=jax.random.key(0), n_photons=2000)
     returned = np.asarray(returns.weight[0]) > 0
     assert np.allclose(np.asarray(returns.time)[returned], 2 * 3.0 / 0.299792458, atol=0.01)
 
@@ -83,7 +93,7 @@ def test_paths_lead_down_to_the_ground_and_up_again():
     scene = jl.Scene(ground=jl.Ground(height=-3.0, reflectance=0.5))
     plan = jl.plan(lidar, scene)
     points = np.asarray(
-        jl.photon_paths(lidar, scene, plan, key=jax.random.key(0), n_photons=100, leaving=4.0)
+        analog.photon_paths(lidar, scene, plan, key=jax.random.key(0), n_photons=100, leaving=4.0)
     )
     assert points.shape == (100, 3, 3)
     assert np.allclose(points[:, 1, 2], -3.0, atol=1e-4)
@@ -98,14 +108,18 @@ def test_bad_input_is_refused():
     plan = jl.plan(LIDAR, scene)
     for cone in (0.0, 91.0, np.nan):
         with pytest.raises(ValueError, match="cone"):
-            jl.analog_returns(LIDAR, scene, plan, key=jax.random.key(0), n_photons=10, cone=cone)
+            analog.analog_returns(LIDAR, scene, plan, key=jax.random.key(0), n_photons=10, cone=cone)
     with pytest.raises(ValueError, match="n_photons"):
-        jl.analog_returns(LIDAR, scene, plan, key=jax.random.key(0), n_photons=0)
+        analog.analog_returns(LIDAR, scene, plan, key=jax.random.key(0), n_photons=0)
     leaf = jl.LeafOptics(reflectance=0.45, transmittance=0.35)
     hot = jl.Scene(canopy=jl.Canopy(slab(leaf=1.0), leaf=leaf, hotspot=True))
     with pytest.raises(ValueError, match="hotspot"):
-        jl.analog_returns(LIDAR, hot, jl.plan(LIDAR, hot), key=jax.random.key(0), n_photons=10)
+        analog.analog_returns(LIDAR, hot, jl.plan(LIDAR, hot), key=jax.random.key(0), n_photons=10)
     straight = jl.Scene(canopy=jl.Canopy(slab(leaf=1.0), leaf=leaf, transmission="straight", hotspot=False))
     two = jl.Lidar(wavelength=(532.0, 1064.0))
     with pytest.raises(ValueError, match="straight"):
-        jl.analog_returns(two, straight, jl.plan(two, straight), key=jax.random.key(0), n_photons=10)
+        analog.analog_returns(two, straight, jl.plan(two, straight), key=jax.random.key(0), n_photons=10)
+    deep = jl.Scene(canopy=jl.Canopy(slab(leaf=1.0), leaf=leaf, hotspot=False), ground=jl.Ground())
+    many_orders = jl.plan(LIDAR, deep, max_orders=300, describe=False)
+    with pytest.raises(ValueError, match="300 orders, too many to keep histories"):
+        analog.analog_returns(LIDAR, deep, many_orders, key=jax.random.key(0), n_photons=10)

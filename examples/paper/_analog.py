@@ -5,19 +5,14 @@ optics with the tracer, but has neither expected returns at every collision, nor
 nor stratified random numbers.
 """
 
-from typing import final
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
-from jaxlidar._checks import check_integer, check_key, check_number
-from jaxlidar._constants import SPEED_OF_LIGHT
-from jaxlidar._mesh_axes import vary_together, vary_with, with_automatic_axes
-from jaxlidar._vectors import along, dot
-from jaxlidar._vmapped_loops import any_problem
+from jaxlidar import SPEED_OF_LIGHT
+from jaxlidar.extend import along, check_integer, check_key, check_number, dot
 from jaxlidar.instrument.lidar import Lidar
 from jaxlidar.planning.plan import Plan
 from jaxlidar.planning.setup import make_setup
@@ -32,7 +27,6 @@ from jaxlidar.trace.photons import Photons
 PHOTONS_PER_CHUNK = 512
 
 
-@final
 class AnalogReturns(eqx.Module):
     """Arrival times and weights of photons followed one by one, as `analog_returns` gives them.
 
@@ -40,17 +34,9 @@ class AnalogReturns(eqx.Module):
       in `Waveform.time`; 0 where it did not return.
     - `weight`: (wavelengths, photons) apparent reflectance that the photon stands for; 0 where it did not
       return. The sum over photons, divided by their number, estimates the apparent reflectance of the scene.
-
-    **Example:**
-
-    >>> import jaxlidar as jl
-    >>> import jax.numpy as jnp
-    >>> returns = jl.AnalogReturns(time=jnp.array([0.0, 12.5]), weight=jnp.array([[0.0, 0.8]]))
-    >>> print(f"{float(returns.weight.sum() / returns.time.size):.2f}")
-    0.40
     """
 
-    time: Float[Array, "photons"]
+    time: Float[Array, " photons"]
     weight: Float[Array, "wavelengths photons"]
 
 
@@ -86,16 +72,6 @@ def analog_returns(
     transmit straight on; and for a plan of so many orders that it keeps no histories.
 
     **Source:** section 1.4 of the paper.
-
-    **Example:**
-
-    >>> import jax
-    >>> import jaxlidar as jl
-    >>> lidar, scene = jl.Lidar(), jl.Scene(ground=jl.Ground(reflectance=0.4))
-    >>> key = jax.random.key(0)
-    >>> returns = jl.analog_returns(lidar, scene, jl.plan(lidar, scene), key=key, n_photons=50_000)
-    >>> print(f"{float(returns.weight.mean()):.1f}")
-    0.4
     """
     check_kinds(lidar, scene)
     check_key(key)
@@ -104,18 +80,16 @@ def analog_returns(
 
 
 @eqx.filter_jit
-@with_automatic_axes
 def _analog_returns(
     lidar: Lidar, scene: Scene, plan: Plan, key: PRNGKeyArray, n_photons: int, cone: float
 ) -> AnalogReturns:
-    lidar, scene, key = vary_together((lidar, scene, key))
     device_scene = _build_scene(lidar, scene, plan)
     monomials = device_scene.histories.monomials(setup_optics(make_setup(lidar, scene, plan)))
     chunk_size = min(PHOTONS_PER_CHUNK, n_photons)
 
     def chunk(key: PRNGKeyArray) -> tuple[Array, Array]:
         start_key, key = jax.random.split(key)
-        start = vary_with(_send_photons(device_scene, chunk_size, start_key), device_scene)
+        start = _send_photons(device_scene, chunk_size, start_key)
 
         def order_step(carry, order):
             def trace(carry):
@@ -124,7 +98,7 @@ def _analog_returns(
                 arrivals = jax.tree.map(lambda a, b: jnp.where(arrived.value > 0, a, b), arrived, arrivals)
                 return onward, arrivals
 
-            return lax.cond(any_problem(carry[0].alive), trace, lambda c: c, carry), None
+            return lax.cond(jnp.any(carry[0].alive), trace, lambda c: c, carry), None
 
         zeros = jnp.zeros_like(start.weight)
         no_arrivals = _Arrivals(zeros, zeros, start.history)
@@ -156,15 +130,6 @@ def photon_paths(
     last collision.
 
     **Raises:** ValueError as for `analog_returns`.
-
-    **Example:**
-
-    >>> import jax
-    >>> import jaxlidar as jl
-    >>> lidar, scene = jl.Lidar(), jl.Scene(ground=jl.Ground())
-    >>> paths = jl.photon_paths(lidar, scene, jl.plan(lidar, scene), key=jax.random.key(0), n_photons=4)
-    >>> print(paths.shape, f"{abs(float(paths[0, 1, 2])):.2f}")
-    (4, 3, 3) 0.00
     """
     check_kinds(lidar, scene)
     check_key(key)
@@ -173,14 +138,12 @@ def photon_paths(
 
 
 @eqx.filter_jit
-@with_automatic_axes
 def _photon_paths(
     lidar: Lidar, scene: Scene, plan: Plan, key: PRNGKeyArray, n_photons: int, leaving: float
 ) -> Float[Array, "photons points 3"]:
-    lidar, scene, key = vary_together((lidar, scene, key))
     device_scene = _build_scene(lidar, scene, plan)
     start_key, key = jax.random.split(key)
-    start = vary_with(_send_photons(device_scene, n_photons, start_key), device_scene)
+    start = _send_photons(device_scene, n_photons, start_key)
 
     def order_step(p, order):
         onward, _ = _trace_flight(device_scene, p, jax.random.fold_in(key, order), 90.0)
@@ -196,9 +159,9 @@ def _photon_paths(
 class _Arrivals(eqx.Module):
     """Photons at the sensor; `value` is zero for those that do not arrive."""
 
-    time: Float[Array, "photons"]
-    value: Float[Array, "photons"]
-    history: Int[Array, "photons"]
+    time: Float[Array, " photons"]
+    value: Float[Array, " photons"]
+    history: Int[Array, " photons"]
 
 
 def _build_scene(lidar: Lidar, scene: Scene, plan: Plan) -> DeviceScene:
