@@ -389,9 +389,9 @@ def test_a_case_defines_a_survey_by_its_flight_line_and_scan_pattern(tmp_path):
     line = {"start": (0, 0), "end": (0, 10), "speed": 50.0, "pulse_rate": 25.0}
     scan = jl.Conical(half_angle=20.0, frequency=40.0)
     assert same(case.survey, jl.Survey.scan(jl.Lidar(altitude=500.0), scan, **line))
-    waveforms = case.simulate(path=tmp_path / "survey.nc")
+    waveforms = case.simulate(path=tmp_path / "survey.zarr")
     assert waveforms.reflectance.shape[:2] == (6, 1)
-    assert len(jl.open(tmp_path / "survey.nc")) == 6
+    assert len(jl.open(tmp_path / "survey.zarr")) == 6
     with pytest.raises(ValueError, match=r"arguments\.atol is not known; the nearest"):
         jl.io.Case(survey=case.survey, arguments={"atol": 0.1})
     with pytest.raises(ValueError, match="the case has no scene and no key"):
