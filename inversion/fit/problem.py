@@ -186,6 +186,15 @@ def check_problem(problem: Problem, *, many: bool = False, recorded: bool = True
     **Raises:** TypeError for what is no problem, ValueError for one of other records.
     """
     check_kind("problem", problem, Problem, "an inversion.Problem")
+    # These are read by NumPy, and bounds decide what is fitted; starts may be traced.
+    of_unknowns = [(u.bounds, u.prior) for u in problem.unknowns if isinstance(u, Unknown)]
+    numbers = of_unknowns, problem.scale, problem.noise_floor
+    if any(isinstance(x, Tracer) for x in jax.tree.leaves(numbers)):
+        raise TypeError(
+            "bounds, priors, scale and noise_floor of a problem are numbers, and JAX traces one of them; "
+            "admissible is a Problem that is made within the transformed function, with traced observed, "
+            "noise, time, lidar or scene"
+        )
     if problem.observed is None and recorded:
         raise ValueError("problem has observed = None; admissible with it is cramer_rao alone")
     if many and not problem.has_many_records:

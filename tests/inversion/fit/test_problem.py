@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import equinox as eqx
 import jax
 import numpy as np
 import pytest
@@ -95,3 +96,11 @@ def test_problems_of_other_records_are_refused(wave):
         inversion.retrieve_many(one, key=KEY)
     with pytest.raises(ValueError, match="one record or more"):
         Problem(np.zeros((0, 1, 9)), LIDAR, SCENE, UNKNOWNS, noise=1.0, time=np.arange(9.0))
+
+
+def test_numbers_that_jax_traces_are_refused(wave):
+    problem = Problem(wave, LIDAR, SCENE, UNKNOWNS, noise=0.002)
+    with pytest.raises(
+        TypeError, match="JAX traces one of them; admissible is a Problem that is made within"
+    ):
+        eqx.filter_jit(lambda problem: inversion.retrieve(problem, key=KEY).values["height"])(problem)
