@@ -27,7 +27,7 @@ from jaxlidar.io.datasets import (
     result_of,
 )
 from jaxlidar.io.groups import StoredGroups, is_result_file, open_groups, write_groups
-from jaxlidar.io.store import check_replaceable, import_packages
+from jaxlidar.io.store import replacing
 from jaxlidar.spectral.waveform import Waveform
 from jaxlidar.truth import Truth
 
@@ -58,8 +58,8 @@ def save(result: Any, path: str | os.PathLike[str], case: Case | None = None) ->
 
     **Raises:** TypeError for an object that no file can hold, or whose scene has classes of your own.
     ImportError where xarray, and h5netcdf or zarr, are not installed. ValueError for a case of other
-    wavelengths or shots, and where a folder of that name exists that is no Zarr store. OSError for a path
-    that cannot be written.
+    wavelengths or shots, and where a folder of that name exists that is no Zarr store, or the store of a run
+    that has not ended. OSError for a path that cannot be written, or that a run has open.
 
     **Example:**
 
@@ -75,11 +75,10 @@ def save(result: Any, path: str | os.PathLike[str], case: Case | None = None) ->
     if case is not None:
         _check_case(result, case)
     path = Path(path)
-    check_replaceable(path)
-    import_packages(path)
-    datasets = datasets_with_case(result, case)
-    with atomic_write(path) as draft:
-        write_groups(draft, datasets)
+    with replacing(path):
+        datasets = datasets_with_case(result, case)
+        with atomic_write(path) as draft:
+            write_groups(draft, datasets)
 
 
 def _check_case(result: Any, case: Case) -> None:

@@ -38,7 +38,7 @@ ROOT_FILE = "zarr.json"
 # The array that tells which rows are complete.
 DONE = "done"
 # The attribute with digests of the problem, as JSON.
-_PROBLEM = "problem"
+PROBLEM = "problem"
 # A chunk of zeros is written, too: a chunk that is not there is missing.
 _CONFIG = {"write_empty_chunks": True}
 # Bytes of an array that are read together, to test their checksums.
@@ -293,6 +293,35 @@ def _attributes(dataset: Any, name: str) -> dict[str, Any]:
 
 
 @contextlib.contextmanager
+def replacing(path: Path) -> Iterator[None]:
+    """Keep runs out of a store while a complete result takes its place; of other files nothing is kept out.
+
+    **Raises:** ValueError for what is no store, and for the store of a run that has not ended. OSError for
+    one that a run has open.
+    """
+    check_replaceable(path)
+    import_packages(path)
+    with contextlib.ExitStack() as stack:
+        if is_zarr(path) and (path / ROOT_FILE).is_file():
+            import zarr
+            from filelock import FileLock
+
+            with _plain_errors(path):
+                # A store without this file was made by `save`.
+                if Path(f"{path}.lock").exists():
+                    stack.enter_context(FileLock(f"{path}.lock", timeout=0))
+                root = zarr.open_group(path, mode="r", zarr_format=3, use_consolidated=False)
+                members = root.members(max_depth=None) if PROBLEM in root.attrs else ()
+                done = [array[...] for name, array in members if name.rpartition("/")[2] == DONE]
+            if not all(map(np.all, done)):
+                raise ValueError(
+                    f"path = {path} is the store of a run that has not ended; nothing is overwritten: give "
+                    "another path, or remove the store"
+                )
+        yield
+
+
+@contextlib.contextmanager
 def open_store(path: str | os.PathLike[str], problem: Mapping[str, str]) -> Iterator[ResultStore]:
     """Open a store, which nobody else can open until the block ends. A missing one is made.
 
@@ -319,10 +348,15 @@ def open_store(path: str | os.PathLike[str], problem: Mapping[str, str]) -> Iter
             path.mkdir(parents=True, exist_ok=True)
             stack.enter_context(FileLock(f"{path}.lock", timeout=0))
             if not (path / ROOT_FILE).is_file():
-                zarr.create_group(path, zarr_format=3, attributes={_PROBLEM: json.dumps(dict(problem))})
+                zarr.create_group(path, zarr_format=3, attributes={PROBLEM: json.dumps(dict(problem))})
             # Metadata that is consolidated is that of a finished run.
             root = zarr.open_group(path, mode="r+", zarr_format=3, use_consolidated=False)
-            stored = json.loads(str(root.attrs.get(_PROBLEM, "{}")))
+            stored = json.loads(str(root.attrs.get(PROBLEM, "{}")))
+        if not stored:
+            raise ValueError(
+                f"path = {path} was not written by a run that could go on, but by save; nothing is "
+                "overwritten: give another path, or remove the store"
+            )
         check_same_problem(path, stored, problem)
         yield ResultStore(path, root)
 

@@ -2,13 +2,17 @@
 
 import errno
 import os
+import shutil
 import subprocess
 import sys
 import time
 from pathlib import Path
 
+import jax
 import numpy as np
 import pytest
+
+import jaxlidar as jl
 
 pytest.importorskip("zarr")
 
@@ -174,6 +178,25 @@ def test_differing_quantities_of_problems_are_named(stored, differing):
     check_same_problem("path", problem, problem)
     with pytest.raises(ValueError, match=rf"path = path holds .* which differs in {differing}; "):
         check_same_problem("path", stored, problem)
+
+
+def test_stores_of_runs_are_not_replaced_by_results(path):
+    wave = jl.simulate(jl.Lidar(), jl.Scene(ground=jl.Ground()), key=jax.random.key(0))
+    with pytest.raises(ValueError, match=r"run\.zarr is the store of a run that has not ended; nothing is"):
+        wave.save(path)
+    with open_store(path, PROBLEM), pytest.raises(OSError, match=r"run\.zarr is in use by another run"):
+        wave.save(path)
+    written(path, [range(COUNT)])
+    wave.save(path)
+    assert np.array_equal(jl.open(path).reflectance, wave.reflectance)
+    with pytest.raises(ValueError, match="not written by a run that could go on, but by save"):
+        written(path)
+
+
+def test_a_store_without_the_array_of_complete_rows_is_not_read(path):
+    shutil.rmtree(path / "fits" / "done")
+    with pytest.raises(ValueError, match=r"run\.zarr: damaged \(no array 'done'"):
+        jl.open(path)
 
 
 @pytest.mark.parametrize("name", ["run.nc", "run.sqlite", "run"])
