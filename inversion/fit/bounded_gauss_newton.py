@@ -103,13 +103,13 @@ def minimum_in_box(
         factor = jax.scipy.linalg.cho_factor(jnp.where(of_free, hessian, jnp.eye(x.size)))
         target = jnp.where(is_free, -(gradient + matmul(hessian, held)), held)
         solution = jnp.where(is_free, jax.scipy.linalg.cho_solve(factor, target), x)
-        way = solution - x
-        room = jnp.where(way > 0, high - x, low - x)
-        is_beyond = is_free & (jnp.abs(way) > jnp.abs(room))
-        fraction = jnp.where(is_beyond, room / jnp.where(is_beyond, way, 1.0), 1.0)
+        step = solution - x
+        to_bound = jnp.where(step > 0, high - x, low - x)
+        is_beyond = is_free & (jnp.abs(step) > jnp.abs(to_bound))
+        fraction = jnp.where(is_beyond, to_bound / jnp.where(is_beyond, step, 1.0), 1.0)
         leaves, first = jnp.any(is_beyond), jnp.argmin(fraction)
-        bound = jnp.where(way[first] > 0, high[first], low[first])
-        at_bound = (x + fraction[first] * way).at[first].set(bound)
+        bound = jnp.where(step[first] > 0, high[first], low[first])
+        at_bound = (x + fraction[first] * step).at[first].set(bound)
         slope = gradient + matmul(hessian, solution)
         inwards = jnp.where(is_free, 0.0, jnp.where(x <= low, -slope, slope)) - rounding
         freed = jnp.argmax(inwards)

@@ -4,8 +4,8 @@ A `Problem` is what a user states. Its constructor checks it and makes a `BoundP
 noise, unknowns bound to scenes, and a plan. `retrieve`, `retrieve_many`, `log_density`, `profile_likelihood`
 and `cramer_rao` take a problem and read the bound one.
 
-Where JAX is tracing any of its numbers, a problem is not bound: the numbers are unknown. `retrieve` makes it
-anew with those that it gets (`inversion.fit.implicit_differentiation`).
+Where JAX is tracing records, noise, times, lidar or scene, a problem is not bound: the numbers are unknown.
+`retrieve` makes it anew with those that it gets (`inversion.fit.implicit_differentiation`).
 """
 
 import dataclasses
@@ -90,8 +90,9 @@ class Problem(eqx.Module):
     """What is to be retrieved from which records: the argument of all fits and of what is asked about them.
 
     It is checked once, as it is made. Unless a plan is given, the simulation is planned here, for the start
-    and the corners of the bounds. `retrieve`, `log_density`, `profile_likelihood` and `cramer_rao` take
-    problems of one record, `retrieve_many` one of many.
+    and the corners of the bounds. Arrays are read then: changes in place come too late. `retrieve`,
+    `log_density`, `profile_likelihood` and `cramer_rao` take problems of one record, `retrieve_many` one of
+    many. For `retrieve` JAX may trace `observed`, `noise`, `time`, lidar, scene and starts.
 
     **Arguments:**
 
@@ -165,6 +166,11 @@ class Problem(eqx.Module):
     max_orders: int | None = eqx.field(default=None, kw_only=True)
 
     def __check_init__(self):
+        if isinstance(self.observed, Sequence) and any(isinstance(a, Waveform) for a in self.observed):
+            raise TypeError(
+                "observed is a sequence of Waveforms; admissible for many records is an array (records, "
+                "wavelengths, bins), such as numpy.stack([w.reflectance for w in waves]), with time="
+            )
         arrays = (self.observed, self.noise, self.time, self.lidar, self.scene)
         if not any(isinstance(x, Tracer) for x in jax.tree.leaves(arrays)):
             self.bound  # noqa: B018
@@ -200,7 +206,7 @@ def check_problem(problem: Problem, *, many: bool = False, recorded: bool = True
     if many and not problem.has_many_records:
         raise ValueError("observed is one record; admissible here is (records, wavelengths, bins)")
     if problem.has_many_records and not many:
-        raise ValueError("observed has many records; admissible here is one: use retrieve_many")
+        raise ValueError("observed has many records; admissible here is one. retrieve_many fits many")
 
 
 def _bind(problem: Problem) -> BoundProblem:

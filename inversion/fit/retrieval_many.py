@@ -176,7 +176,9 @@ def _parts_of_unknowns(unknowns: list[list[BoundUnknown]]) -> dict[str, Any]:
         dependencies[f"where or apply of {u.name!r}"] = u.setter
         dependencies[f"bounds of {u.name!r}"] = u.low, u.high
         dependencies[f"prior of {u.name!r}"] = (u.prior, u.is_log_prior) if u.smooth is None else u.smooth
-        dependencies[f"start of {u.name!r}"] = [u.start, *(v.start for v in in_other_footprints)]
+        starts = np.stack([u.start, *(v.start for v in in_other_footprints)])
+        # One start for all, or the same one for each.
+        dependencies[f"start of {u.name!r}"] = starts[:1] if np.all(starts == starts[0]) else starts
     return dependencies
 
 

@@ -46,7 +46,8 @@ class Response(eqx.Module):
     Multiplied by the optics of each history (see `jaxlidar.waveform_of`) it gives the waveform. The first
     axis has one run of the tracer for all wavelengths; or one for each, where leaves transmit straight on, so
     that extinction depends on the wavelength, and where optics are applied while light is traced, because
-    histories would be too many: then there is one history, and its optics are 1.
+    histories would be too many: then there is one history, and its optics are 1. Results of many shots, by
+    `jax.vmap`, have an axis of shots before it.
 
     - `first`: (traces, materials, first histories, bins) order one, apparent reflectance per unit optics.
     - `higher`: (traces, materials, histories, bins) orders two and above, or None where they were not traced.

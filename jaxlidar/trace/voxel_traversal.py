@@ -343,7 +343,7 @@ class DepthCrossings(eqx.Module):
     path_slopes: PathSlopes | None = None
 
 
-class _PathSlopes(NamedTuple):
+class _MarchSlopes(NamedTuple):
     """Derivatives by the direction of a ray, of the distance of the last face and of the depth up to there.
 
     - `extinction`: of the last voxel, 1/m.
@@ -370,7 +370,7 @@ class _March(NamedTuple):
     running: Bool[Array, "photons"]
     crossings: tuple[Array, ...]
     depth_slopes: Float[Array, "ends parameters photons"] | None
-    path_slopes: _PathSlopes | None
+    path_slopes: _MarchSlopes | None
 
 
 def march_to_depths(
@@ -471,7 +471,7 @@ def march_to_depths(
                 along_z = medium.leaf_extinction(cell, w) * angle_slope * (to - distance)
                 along_z = select(running, along_z, jnp.zeros_like(along_z))
                 by_direction = (*by_direction[:2], by_direction[2] + along_z)
-            path_slopes = lax.stop_gradient(_PathSlopes(far, by_direction, select(running, k, extinction)))
+            path_slopes = lax.stop_gradient(_MarchSlopes(far, by_direction, select(running, k, extinction)))
         # The voxel of a ray that has stopped does not matter.
         next_voxel = step_voxel(ray, voxel, faces, to)
         distance, depth = select(running, to, distance), select(running, next_depth, depth)
@@ -497,7 +497,7 @@ def march_to_depths(
     depth = jnp.zeros_like(max_length)
     path_slopes = None
     if by_path:
-        path_slopes = _PathSlopes(enter_by_direction, (depth, depth, depth), depth)
+        path_slopes = _MarchSlopes(enter_by_direction, (depth, depth, depth), depth)
     state = _March(start, depth, ray.voxel, running, no_crossings, depth_slopes, path_slopes)
     state = vary_together(state)
 

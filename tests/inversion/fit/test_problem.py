@@ -94,6 +94,8 @@ def test_problems_of_other_records_are_refused(wave):
             function(none, key=KEY)
     with pytest.raises(ValueError, match="observed is one record"):
         inversion.retrieve_many(one, key=KEY)
+    with pytest.raises(TypeError, match=r"sequence of Waveforms; admissible .* numpy\.stack"):
+        Problem([wave, wave], LIDAR, SCENE, UNKNOWNS, noise=1.0)
     with pytest.raises(ValueError, match="one record or more"):
         Problem(np.zeros((0, 1, 9)), LIDAR, SCENE, UNKNOWNS, noise=1.0, time=np.arange(9.0))
 
