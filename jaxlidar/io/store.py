@@ -311,7 +311,7 @@ def replacing(path: Path) -> Iterator[None]:
                 if Path(f"{path}.lock").exists():
                     stack.enter_context(FileLock(f"{path}.lock", timeout=0))
                 root = zarr.open_group(path, mode="r", zarr_format=3, use_consolidated=False)
-                members = root.members(max_depth=None) if PROBLEM in root.attrs else ()
+                members: Any = root.members(max_depth=None) if PROBLEM in root.attrs else ()
                 done = [array[...] for name, array in members if name.rpartition("/")[2] == DONE]
             if not all(map(np.all, done)):
                 raise ValueError(
