@@ -125,19 +125,20 @@ class SurveyResults:
 
     def add(self, number: int, result: Any) -> None:
         """Add the result of a task."""
+        results = self.strategy.results_of_task(number, result)
         if number < self.strategy.n_contributions:
-            self.contributions[number] = result
+            self.contributions[number] = results
         else:
-            results = self.strategy.results_of_task(number, result)
             self._rows(number).write(self.strategy.shots_of_task(number), results)
 
     def sum_contributions(self) -> None:
         """Add the light of all shots whose contributions are there."""
-        for shots in self.strategy.shot_slices if self.strategy.n_contributions else ():
+        contribution_sum = self.strategy.contribution_sum
+        if contribution_sum is None:
+            return
+        for shots in self.strategy.shot_slices:
             if not np.all(self.light.is_done[shots]):
-                self.light.write(
-                    shots, self.strategy.sum_contributions(self.contributions.__getitem__, shots)
-                )
+                self.light.write(shots, contribution_sum(self.contributions.__getitem__, shots))
 
 
 def waveforms_in_memory(

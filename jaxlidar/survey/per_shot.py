@@ -192,6 +192,14 @@ class PerShotStrategy(AbstractStrategy):
         return len(self.shot_slices)
 
     @property
+    def n_light_tasks(self) -> int:
+        return self.n_tasks
+
+    @property
+    def contribution_sum(self) -> None:
+        return None
+
+    @property
     def shot_slices(self) -> list[slice]:
         return slices_of_shots(len(self.survey), self.shots_per_chunk)
 

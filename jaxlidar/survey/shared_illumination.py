@@ -67,7 +67,7 @@ from jaxlidar.spectral.apply_optics import (
 )
 from jaxlidar.survey.node_groups import NodeAllocation, NodeGroup
 from jaxlidar.survey.results import ShotErrors, ShotResults, make_shot_results
-from jaxlidar.survey.strategy import AbstractStrategy, Shots, slices_of_shots
+from jaxlidar.survey.strategy import AbstractStrategy, ContributionSum, Shots, slices_of_shots
 from jaxlidar.survey.view_geometry import ViewGeometry
 from jaxlidar.trace.device_scene import DeviceScene, aim_at, build_device_scene
 from jaxlidar.trace.entry_nodes import EntryNodes
@@ -137,13 +137,20 @@ class SharedIlluminationStrategy(AbstractStrategy):
         return slices_of_shots(len(self.survey), SHOTS_PER_BLOCK)
 
     @property
-    def n_contributions(self) -> int:
+    def n_light_tasks(self) -> int:
         return len(self.groups)
+
+    @property
+    def contribution_sum(self) -> ContributionSum:
+        return self._sum_contributions
 
     def shots_of_task(self, number: int) -> Shots:
         return self.groups[number].shots
 
-    def sum_contributions(self, contribution_of: Callable[[int], Any], shots: slice) -> ShotResults:
+    def results_of_task(self, number: int, result: Any) -> Any:
+        return result
+
+    def _sum_contributions(self, contribution_of: Callable[[int], Any], shots: slice) -> ShotResults:
         numbers = [
             number
             for number, group in enumerate(self.groups)

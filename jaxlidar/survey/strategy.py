@@ -16,6 +16,8 @@ from jaxlidar.survey.results import ShotResults
 
 # Shots of a task: a slice, or their numbers.
 Shots: TypeAlias = slice | Int[np.ndarray, " shots"]
+# The results of one of `shot_slices`, from a function that gives the contribution of a task.
+ContributionSum: TypeAlias = Callable[[Callable[[int], Any], slice], ShotResults]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -46,14 +48,19 @@ class AbstractStrategy(abc.ABC):
         """Number of tasks."""
 
     @property
+    @abc.abstractmethod
     def n_light_tasks(self) -> int:
-        """Number of tasks that trace light; those after them find the truth. Default: all."""
-        return self.n_tasks
+        """Number of tasks that trace light; those after them find the truth."""
+
+    @property
+    @abc.abstractmethod
+    def contribution_sum(self) -> ContributionSum | None:
+        """Sum over tasks that gives the light of shots; None where each shot is one task's."""
 
     @property
     def n_contributions(self) -> int:
-        """Number of tasks, the first ones, of which shots are sums (`sum_contributions`). Default: none."""
-        return 0
+        """Number of tasks, the first ones, whose results are contributions."""
+        return 0 if self.contribution_sum is None else self.n_light_tasks
 
     @property
     @abc.abstractmethod
@@ -64,13 +71,9 @@ class AbstractStrategy(abc.ABC):
     def shots_of_task(self, number: int) -> Shots:
         """Return the shots of a task: their numbers, or a slice."""
 
+    @abc.abstractmethod
     def results_of_task(self, number: int, result: Any) -> Any:
-        """Return the results of exactly the shots of a task, a `ShotResults` or `Truths`, from its own."""
-        return result
-
-    def sum_contributions(self, contribution_of: Callable[[int], Any], shots: slice) -> ShotResults:
-        """Return the results of one of `shot_slices`; `contribution_of` gives the contribution of a task."""
-        raise NotImplementedError("no task is a contribution")
+        """Return what a task adds: a `ShotResults` or `Truths` of its shots alone, or a contribution."""
 
     @abc.abstractmethod
     def info(self) -> dict[str, Any]:

@@ -236,6 +236,10 @@ class TiledSceneStrategy(AbstractStrategy):
     def n_light_tasks(self) -> int:
         return len(self.tiles)
 
+    @property
+    def contribution_sum(self) -> None:
+        return None
+
     def shots_of_task(self, number: int) -> Shots:
         return self.tiles[number % len(self.tiles)].shots
 

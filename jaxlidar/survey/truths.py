@@ -1,7 +1,6 @@
 """Truth of the shots of a survey: reference quantities of what each beam meets in the scene."""
 
 import dataclasses
-from collections.abc import Callable
 from typing import Any, final
 
 import equinox as eqx
@@ -18,8 +17,7 @@ from jaxlidar.io.netcdf import TRUTH_QUANTITIES
 from jaxlidar.planning.setup import Setup
 from jaxlidar.spectral.apply_optics import make_waveform_model
 from jaxlidar.survey.per_shot import ShotGeometry, aim_offset, setup_of_shot, shot_geometry
-from jaxlidar.survey.results import ShotResults
-from jaxlidar.survey.strategy import AbstractStrategy, Shots, first_rows
+from jaxlidar.survey.strategy import AbstractStrategy, ContributionSum, Shots, first_rows
 from jaxlidar.trace.device_scene import DeviceScene, aim_at, build_device_scene
 from jaxlidar.truth import Truth, compute_labels, first_order_setup
 
@@ -115,8 +113,8 @@ class StrategyWithTruth(AbstractStrategy):
         return self.light_strategy.n_tasks
 
     @property
-    def n_contributions(self) -> int:
-        return self.light_strategy.n_contributions
+    def contribution_sum(self) -> ContributionSum | None:
+        return self.light_strategy.contribution_sum
 
     def shots_of_task(self, number: int) -> Shots:
         n_light = self.n_light_tasks
@@ -126,14 +124,11 @@ class StrategyWithTruth(AbstractStrategy):
             else self.shot_slices[number - n_light]
         )
 
-    def results_of_task(self, number: int, result: Any) -> ShotResults | Truths:
+    def results_of_task(self, number: int, result: Any) -> Any:
         n_light = self.n_light_tasks
         if number < n_light:
             return self.light_strategy.results_of_task(number, result)
         return first_rows(result, self.shot_slices[number - n_light])
-
-    def sum_contributions(self, contribution_of: Callable[[int], Any], shots: slice) -> ShotResults:
-        return self.light_strategy.sum_contributions(contribution_of, shots)
 
     def info(self) -> dict[str, Any]:
         return self.light_strategy.info()
