@@ -78,28 +78,13 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 from jaxlidar import extend, io
-from jaxlidar._checks import UnitWarning
-from jaxlidar._compilation_cache import CompilationCache, compilation_cache
 from jaxlidar._constants import SPEED_OF_LIGHT
+from jaxlidar._fields.checks import UnitWarning
 from jaxlidar._fingerprint import version_of
+from jaxlidar._jax.compilation_cache import CompilationCache, compilation_cache
+from jaxlidar._jax.workers import LostWorkersWarning
 from jaxlidar._progress import Progress, TaskProgress
 from jaxlidar._registry import register_public_objects, waveform_html
-from jaxlidar._workers import LostWorkersWarning
-from jaxlidar.energy import EnergyBudget, energy_budget
-from jaxlidar.instrument.catalogue import InstrumentValue, instrument, instrument_sources, instruments
-from jaxlidar.instrument.lidar import Lidar
-from jaxlidar.instrument.photon_counter import PhotonCounter, PhotonEvents
-from jaxlidar.instrument.pulse import (
-    AbstractPulse,
-    ExponentiallyModifiedGaussianPulse,
-    GaussianPulse,
-    RectangularPulse,
-    SampledPulse,
-)
-from jaxlidar.instrument.receiver import Receiver, first_return_window, record
-from jaxlidar.instrument.scan import AbstractScan, Conical, Oscillating, RotatingPolygon
-from jaxlidar.instrument.survey import Survey
-from jaxlidar.instrument.trajectory import Trajectory
 from jaxlidar.io.netcdf import open, rerun
 from jaxlidar.optics.coefficients import load_coefficients
 from jaxlidar.optics.laws import AbstractLaw, AbstractMirror, EqualAngle, Lambertian, Specular
@@ -110,7 +95,6 @@ from jaxlidar.optics.phase import AbstractPhase, HenyeyGreenstein, Isotropic
 from jaxlidar.optics.plate_model import plate_model
 from jaxlidar.optics.prospect import Prospect, prospect_jacobian, prospect_spectra
 from jaxlidar.optics.spectra import Spectrum, read_spectrum_csv, spectrum, spectrum_names
-from jaxlidar.passive import ReflectanceFactor, plan_reflectance, reflectance_factor
 from jaxlidar.planning.effects import Effect
 from jaxlidar.planning.plan import Plan, plan
 from jaxlidar.planning.scene_family import plan_scenes
@@ -125,7 +109,6 @@ from jaxlidar.plants.stand import Stand
 from jaxlidar.plants.tree import Tree
 from jaxlidar.plants.turtle import turtle
 from jaxlidar.plants.voxelise import trim_empty_layers, voxelise, voxelise_copies, voxelise_points
-from jaxlidar.scene_batch import SceneWaveforms, simulate_scenes
 from jaxlidar.scenes.atmosphere import Atmosphere
 from jaxlidar.scenes.canopy import Canopy
 from jaxlidar.scenes.mesh_surface import MeshInstances, MeshSurface
@@ -136,7 +119,25 @@ from jaxlidar.scenes.shapes import AbstractShape, OutlineWarning, Plane
 from jaxlidar.scenes.surfaces import AbstractGround, AbstractSheet, AbstractSurface, Ground, Plate
 from jaxlidar.scenes.terrain import Terrain
 from jaxlidar.scenes.voxels import VoxelMap
-from jaxlidar.simulate import LateLightWarning, UnfollowedLightWarning, simulate
+from jaxlidar.sensors.catalogue import InstrumentValue, instrument, instrument_sources, instruments
+from jaxlidar.sensors.lidar import Lidar
+from jaxlidar.sensors.photon_counter import PhotonCounter, PhotonEvents
+from jaxlidar.sensors.pulse import (
+    AbstractPulse,
+    ExponentiallyModifiedGaussianPulse,
+    GaussianPulse,
+    RectangularPulse,
+    SampledPulse,
+)
+from jaxlidar.sensors.receiver import Receiver, first_return_window, record
+from jaxlidar.sensors.scan import AbstractScan, Conical, Oscillating, RotatingPolygon
+from jaxlidar.sensors.survey import Survey
+from jaxlidar.sensors.trajectory import Trajectory
+from jaxlidar.simulation.energy import EnergyBudget, energy_budget
+from jaxlidar.simulation.many_scenes import SceneWaveforms, simulate_scenes
+from jaxlidar.simulation.one_scene import LateLightWarning, UnfollowedLightWarning, simulate
+from jaxlidar.simulation.reflectance import ReflectanceFactor, plan_reflectance, reflectance_factor
+from jaxlidar.simulation.truth import Truth, truth_of
 from jaxlidar.spectral.waveform import Waveform, total_reflectance, waveform_of
 from jaxlidar.survey.acquisition import Acquisition
 from jaxlidar.survey.coverage import OffMapWarning, ground_position
@@ -145,7 +146,6 @@ from jaxlidar.survey.simulate_many import simulate_many
 from jaxlidar.survey.truths import Truths
 from jaxlidar.survey.waveforms import Waveforms
 from jaxlidar.trace.response import Response, trace_scene
-from jaxlidar.truth import Truth, truth_of
 
 if TYPE_CHECKING:
     from jaxlidar import plot

@@ -23,7 +23,7 @@ For laws, pulses and surfaces of your own, and for packages on top such as `inve
 - `decompose_records.register` makes a function the decomposition of `Waveforms.returns`; `inversion` does.
 """
 
-from jaxlidar._checks import (
+from jaxlidar._fields.checks import (
     as_array,
     as_numpy,
     as_scalar,
@@ -38,12 +38,13 @@ from jaxlidar._checks import (
     even_step,
     warn_user,
 )
+from jaxlidar._fields.ranges import Range, check_ranges, inadmissible, reasons
 from jaxlidar._fingerprint import fingerprint
-from jaxlidar._one_function import once
-from jaxlidar._products import einsum, matmul, tensordot
-from jaxlidar._ranges import Range, check_ranges, inadmissible, reasons
+from jaxlidar._jax.one_function import once
+from jaxlidar._jax.products import einsum, matmul, tensordot
+from jaxlidar._jax.threads import ONE_CORE, side_by_side
+from jaxlidar._jax.workers import outcomes, task
 from jaxlidar._registry import decompose_records
-from jaxlidar._threads import ONE_CORE, side_by_side
 from jaxlidar._vectors import (
     Scalar,
     Vec,
@@ -58,7 +59,6 @@ from jaxlidar._vectors import (
     scale,
     vec,
 )
-from jaxlidar._workers import outcomes, task
 from jaxlidar.scenes.scene import check_kinds
 
 __all__ = [

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import jaxlidar as jl
-from jaxlidar._checks import as_array, as_numpy, check_integer, check_range, concrete
+from jaxlidar._fields.checks import as_array, as_numpy, check_integer, check_range, concrete
 
 MASKED = np.ma.array([1.0, 2.0], mask=[False, True])
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import jaxlidar as jl
-from jaxlidar._checks import check_range
+from jaxlidar._fields.checks import check_range
 from jaxlidar._text import number_text, object_text
 
 

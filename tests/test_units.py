@@ -11,7 +11,7 @@ import pytest
 import inversion
 import jaxlidar as jl
 from jaxlidar import UnitWarning
-from jaxlidar._checks import MAGNITUDES
+from jaxlidar._fields.checks import MAGNITUDES
 from tests.helpers import ask
 
 UNKNOWN = inversion.Unknown(lambda s: s.ground.reflectance, bounds=(0.0, 1.0))

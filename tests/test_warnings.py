@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import jaxlidar as jl
-from jaxlidar._checks import warn_user
+from jaxlidar._fields.checks import warn_user
 
 KEY = jax.random.key(5)
 LIDAR = jl.Lidar()

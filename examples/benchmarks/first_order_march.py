@@ -26,8 +26,8 @@ from _common import best, machine, new_figure, options, print_table, race, save_
 import jaxlidar as jl
 from jaxlidar import SPEED_OF_LIGHT
 from jaxlidar.extend import along
-from jaxlidar.trace.first_order import FACET_BACKSCATTER
-from jaxlidar.trace.footprint import fibonacci_disc, make_beam
+from jaxlidar.trace.first.first_order import FACET_BACKSCATTER
+from jaxlidar.trace.first.footprint import fibonacci_disc, make_beam
 
 BATCHES = 4
 SHAPE, EDGE = (64, 64, 128), 0.25

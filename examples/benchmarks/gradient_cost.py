@@ -9,7 +9,7 @@ the gradient with the value (within a transformation each simulates eight batche
 voxels are empty; further, `simulate` as users call it, with the same photons. Seconds are of the processor,
 the fastest of some rounds in turns: other load of the machine matters less. Memory is what the compiler
 reserves beside arguments and results; it is given for four times the rays and photons, too. Reverse mode by
-replay is explained in `jaxlidar/trace/replay.py`.
+replay is explained in `jaxlidar/trace/derivatives/replay.py`.
 """
 
 import time

@@ -13,16 +13,16 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from jaxlidar import SPEED_OF_LIGHT
 from jaxlidar.extend import along, check_integer, check_key, check_number, dot
-from jaxlidar.instrument.lidar import Lidar
 from jaxlidar.planning.plan import Plan
 from jaxlidar.planning.setup import make_setup
 from jaxlidar.scenes.scene import Scene, check_kinds
+from jaxlidar.sensors.lidar import Lidar
 from jaxlidar.spectral.apply_optics import setup_optics
 from jaxlidar.trace.device_scene import DeviceScene, build_device_scene
-from jaxlidar.trace.footprint import across_beam
-from jaxlidar.trace.meshes import clear_of_mesh
-from jaxlidar.trace.photon_step import collide, fly_once, passed_plates, start_photons
-from jaxlidar.trace.photons import Photons
+from jaxlidar.trace.first.footprint import across_beam
+from jaxlidar.trace.march.meshes import clear_of_mesh
+from jaxlidar.trace.photons.photon_step import collide, fly_once, passed_plates, start_photons
+from jaxlidar.trace.photons.photons import Photons
 
 PHOTONS_PER_CHUNK = 512
 

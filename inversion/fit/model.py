@@ -5,8 +5,8 @@ applied to response(x). A column dw/dx_k of the Jacobian is computed
 
 - for an *optical* unknown from the derivative of the optics: a small matrix product with the response;
 - for an unknown that changes *extinction* only, from the score function of the traced paths, d log(path
-  probability) / d x_k (likelihood-ratio method, `jaxlidar.trace.score_functions`), if that is possible and
-  pays;
+  probability) / d x_k (likelihood-ratio method, `jaxlidar.trace.derivatives.score_functions`), if that is
+  possible and pays;
 - for any other, *geometric* unknown as a tangent (forward-mode derivative) pushed through the trace; all
   tangents share one pass, or as many as memory allows.
 
@@ -57,10 +57,10 @@ from jaxlidar.extend import ONE_CORE, concrete, side_by_side
 from jaxlidar.planning.memory import format_bytes, memory_limit, scored_bytes
 from jaxlidar.planning.plan_check import is_in_reach
 from jaxlidar.spectral.apply_optics import derivatives_to_samples, make_waveform_model, setup_optics
+from jaxlidar.trace.derivatives.extinction_slopes import ExtinctionSlopes
+from jaxlidar.trace.derivatives.score_functions import make_slopes
 from jaxlidar.trace.device_scene import build_device_scene
-from jaxlidar.trace.extinction_slopes import ExtinctionSlopes
 from jaxlidar.trace.response import trace_with_scores
-from jaxlidar.trace.score_functions import make_slopes
 
 Values = tuple[Array, ...]
 # Batches of a pilot evaluation: a quarter of the work of all, and the least that shows its own noise.

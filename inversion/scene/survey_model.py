@@ -8,9 +8,9 @@ with the waveform w_i of a scene of unknowns x, and the gain s_i and offset o_i 
 hundreds of shots and a hundred thousand unknowns the Jacobian J of all m_i is never formed. A fit needs its
 products with vectors:
 
-- J^T c, by reverse mode: with respect to extinction by replay of the paths (`jaxlidar.trace.replay`), at the
-  cost of three waveforms however many voxels there are. With c = (m - y) / sigma^2 it is the gradient of half
-  of chi-squared.
+- J^T c, by reverse mode: with respect to extinction by replay of the paths
+  (`jaxlidar.trace.derivatives.replay`), at the cost of three waveforms however many voxels there
+  are. With c = (m - y) / sigma^2 it is the gradient of half of chi-squared.
 - J^T J v, the Gauss-Newton product, by forward mode and reverse mode in turn.
 
 **Chunks.** Shots are sorted by place and cut into chunks of one size; a compiled program traces the shots of

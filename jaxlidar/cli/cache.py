@@ -3,8 +3,8 @@
 import contextlib
 from collections.abc import Iterator
 
-from jaxlidar import _compilation_cache
-from jaxlidar._checks import warn_user
+from jaxlidar._fields.checks import warn_user
+from jaxlidar._jax import compilation_cache as package_cache
 
 
 @contextlib.contextmanager
@@ -14,7 +14,7 @@ def compilation_cache() -> Iterator[None]:
     Afterwards the configuration of JAX is restored, as Python code that calls the command may need its own.
     """
     try:
-        cache = _compilation_cache.compilation_cache()
+        cache = package_cache.compilation_cache()
     except OSError as error:
         warn_user(f"compiled programs are not kept: {error}")
         yield

@@ -17,11 +17,11 @@ from jaxlidar.cli.shared import (
     simulation_progress_bar,
     survey_progress_bar,
 )
-from jaxlidar.instrument.lidar import Lidar
 from jaxlidar.io import Case, read_case
 from jaxlidar.io.netcdf import open as open_result
 from jaxlidar.io.store import is_zarr, remove_store, store_beside
 from jaxlidar.planning.plan import plan as make_plan
+from jaxlidar.sensors.lidar import Lidar
 
 # Arguments of `simulate` that `jaxlidar.plan` has, too.
 _PLAN_ARGUMENTS = ("rtol", "max_orders", "max_step", "n_rays", "window", "bin_width", "footprint", "effects")

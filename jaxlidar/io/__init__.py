@@ -1,6 +1,5 @@
 """Files: recorded waveforms, voxel maps, points, tree models, meshes and terrain; cases and results."""
 
-from jaxlidar._files import atomic_write
 from jaxlidar.io.airborne import (
     AirborneShot,
     AirborneShots,
@@ -14,6 +13,7 @@ from jaxlidar.io.case import Case, write_case
 from jaxlidar.io.checks import FileWarning
 from jaxlidar.io.datasets import keep_as_netcdf
 from jaxlidar.io.dem import DemRead, read_dem
+from jaxlidar.io.files import atomic_write
 from jaxlidar.io.gedi import GediShot, read_gedi_l1b
 from jaxlidar.io.gedi_level2 import read_gedi_l2a, read_gedi_l2b
 from jaxlidar.io.gedi_writer import write_gedi_l1b

@@ -20,7 +20,7 @@ from typing import Any, NamedTuple, overload
 import numpy as np
 from jaxtyping import Bool, Float, Int, Shaped
 
-from jaxlidar._checks import as_numpy, check_number, check_numbers, check_shape
+from jaxlidar._fields.checks import as_numpy, check_number, check_numbers, check_shape
 from jaxlidar.io.coordinates import is_angle
 from jaxlidar.io.noise import NoiseLevels, above_pedestal, estimate_noise_levels
 

@@ -26,11 +26,9 @@ import jax
 import numpy as np
 from jaxtyping import PRNGKeyArray
 
-from jaxlidar._checks import check_integer, check_key, check_kind
-from jaxlidar._files import atomic_writes
+from jaxlidar._fields.checks import check_integer, check_key, check_kind
 from jaxlidar._registry import simulate_survey
-from jaxlidar.instrument.lidar import Lidar
-from jaxlidar.instrument.survey import Survey
+from jaxlidar.io.files import atomic_writes
 from jaxlidar.io.kinds import UNITS, Argument
 from jaxlidar.io.npz import read_arrays
 from jaxlidar.io.toml import (
@@ -43,7 +41,9 @@ from jaxlidar.io.toml import (
     with_references,
 )
 from jaxlidar.scenes.scene import Scene
-from jaxlidar.simulate import simulate
+from jaxlidar.sensors.lidar import Lidar
+from jaxlidar.sensors.survey import Survey
+from jaxlidar.simulation.one_scene import simulate
 
 # Arguments of `simulate` that a file cannot hold, or that a case has as fields.
 _EXCLUDED_ARGUMENTS = ("lidar", "scene", "key", "plan", "progress")

@@ -26,7 +26,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
-from jaxlidar._checks import check_kind
+from jaxlidar._fields.checks import check_kind
 from jaxlidar.io.checks import TWO_WAY_METRES_PER_NS, TWO_WAY_TOLERANCE
 
 # Numbers of the variable length records of LAS and PulseWaves files that declare the system: GeoTIFF keys

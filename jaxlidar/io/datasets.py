@@ -34,13 +34,13 @@ import numpy as np
 from jaxtyping import Bool
 
 from jaxlidar._not_kept import NotKept
-from jaxlidar.instrument.lidar import Lidar
 from jaxlidar.io.case import Case, case_of, case_text
 from jaxlidar.io.checks import refuse_damage
 from jaxlidar.io.groups import StoredArray, StoredGroups
 from jaxlidar.io.kinds import admits_tuple
 from jaxlidar.io.toml import nearest
 from jaxlidar.scenes.scene import Scene
+from jaxlidar.sensors.lidar import Lidar
 
 # The group of entry points that name the modules which call `keep_as_netcdf`, by class.
 ENTRY_POINTS = "jaxlidar.files"

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from jaxlidar._checks import check_number, check_numbers, check_shape
+from jaxlidar._fields.checks import check_number, check_numbers, check_shape
 from jaxlidar.io.checks import MAX_COORDINATE, check_unpacked_size, existing_file
 from jaxlidar.io.coordinates import (
     MAX_ELEVATION,

@@ -32,7 +32,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from jaxlidar._checks import check_numbers, warn_user
+from jaxlidar._fields.checks import check_numbers, warn_user
 from jaxlidar.io.checks import (
     MAX_COORDINATE,
     MAX_COUNTS,

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jaxlidar._checks import check_numbers, warn_user
+from jaxlidar._fields.checks import check_numbers, warn_user
 from jaxlidar.io.checks import FileWarning
 from jaxlidar.io.hdf5 import ProductFile, open_hdf5
 from jaxlidar.io.tables import Column, ColumnAxis, ShotTable

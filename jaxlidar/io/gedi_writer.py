@@ -19,7 +19,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, PRNGKeyArray
 
-from jaxlidar._checks import (
+from jaxlidar._constants import SPEED_OF_LIGHT
+from jaxlidar._fields.checks import (
     check_choice,
     check_integer,
     check_key,
@@ -30,14 +31,13 @@ from jaxlidar._checks import (
     check_shape,
     concrete_number,
 )
-from jaxlidar._constants import SPEED_OF_LIGHT
-from jaxlidar._files import atomic_write
 from jaxlidar._fingerprint import version_of
-from jaxlidar.instrument.lidar import Lidar
-from jaxlidar.instrument.receiver import Receiver
-from jaxlidar.instrument.survey import Survey
 from jaxlidar.io.checks import MAX_COUNTS
 from jaxlidar.io.coordinates import metric_system
+from jaxlidar.io.files import atomic_write
+from jaxlidar.sensors.lidar import Lidar
+from jaxlidar.sensors.receiver import Receiver
+from jaxlidar.sensors.survey import Survey
 from jaxlidar.spectral.waveform import Waveform, energy_at_reference
 
 # Groups of beams: the number of the laser's channel, and True for a beam with the full power of its laser.

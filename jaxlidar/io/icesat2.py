@@ -23,7 +23,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from jaxlidar._checks import check_choice, check_number, check_range, check_shape, warn_user
+from jaxlidar._fields.checks import check_choice, check_number, check_range, check_shape, warn_user
 from jaxlidar.io.checks import MAX_COORDINATE, MAX_EXACT_INTEGER, FileWarning
 from jaxlidar.io.hdf5 import ProductFile, open_hdf5, text_of_attribute
 from jaxlidar.io.tables import Column, ShotTable

@@ -11,14 +11,8 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import numpy as np
 
-from jaxlidar._checks import check_kind, concrete_array
+from jaxlidar._fields.checks import check_kind, concrete_array
 from jaxlidar._registry import public_objects
-from jaxlidar.instrument.catalogue import instrument
-from jaxlidar.instrument.lidar import Lidar
-from jaxlidar.instrument.pulse import SampledPulse
-from jaxlidar.instrument.receiver import Receiver
-from jaxlidar.instrument.survey import Survey
-from jaxlidar.instrument.trajectory import Trajectory
 from jaxlidar.io.dem import DemRead, read_dem
 from jaxlidar.io.inventory import read_inventory
 from jaxlidar.io.las import read_las
@@ -41,9 +35,15 @@ from jaxlidar.plants.voxelise import trim_empty_layers, voxelise, voxelise_point
 from jaxlidar.scenes.mesh_surface import MeshInstances, MeshSurface
 from jaxlidar.scenes.surfaces import AbstractGround, AbstractSheet, Ground, Plate
 from jaxlidar.scenes.voxels import VoxelMap
+from jaxlidar.sensors.catalogue import instrument
+from jaxlidar.sensors.lidar import Lidar
+from jaxlidar.sensors.pulse import SampledPulse
+from jaxlidar.sensors.receiver import Receiver
+from jaxlidar.sensors.survey import Survey
+from jaxlidar.sensors.trajectory import Trajectory
 
 # Exported classes of these packages are kinds.
-_PACKAGES = ("jaxlidar.optics.", "jaxlidar.instrument.", "jaxlidar.scenes.")
+_PACKAGES = ("jaxlidar.optics.", "jaxlidar.sensors.", "jaxlidar.scenes.")
 # But for results of photon counting, which come after a simulation.
 _NO_KINDS = ("PhotonEvents",)
 # Functions that return scenes or lidars, or objects in them, and classes of other packages.

@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 from jaxtyping import ArrayLike, Num
 
-from jaxlidar._checks import as_numpy, check_number, check_range, check_shape
-from jaxlidar._files import atomic_write
+from jaxlidar._fields.checks import as_numpy, check_number, check_range, check_shape
 from jaxlidar.io.checks import MAX_COORDINATE, existing_file
 from jaxlidar.io.coordinates import WKT_RECORD, CoordinateSystem, check_elevations, metric_system
+from jaxlidar.io.files import atomic_write
 from jaxlidar.io.las_header import PROJECTION_USER, LasHeader, read_header
 from jaxlidar.io.laz import decompress_points
 from jaxlidar.plants.point_cloud import PointCloud

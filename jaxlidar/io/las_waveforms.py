@@ -26,7 +26,6 @@ from typing import Any, BinaryIO, NamedTuple, final
 import numpy as np
 from jaxtyping import Bool, Float, Int, Shaped
 
-from jaxlidar._files import atomic_writes
 from jaxlidar.io.airborne import AirborneShot, AirborneShots, Returns, Segment, evenly_spaced
 from jaxlidar.io.checks import MAX_COORDINATE, existing_file
 from jaxlidar.io.coordinates import (
@@ -36,6 +35,7 @@ from jaxlidar.io.coordinates import (
     system_of_name,
     wkt_of_units,
 )
+from jaxlidar.io.files import atomic_writes
 from jaxlidar.io.las import (
     import_laspy,
     las_path,

@@ -16,7 +16,7 @@ from typing import Any, final
 import numpy as np
 from jaxtyping import Float
 
-from jaxlidar._checks import warn_user
+from jaxlidar._fields.checks import warn_user
 from jaxlidar.io.airborne import AirborneShots, Segment, evenly_spaced
 from jaxlidar.io.checks import (
     MAX_COUNTS,

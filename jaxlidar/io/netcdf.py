@@ -11,10 +11,8 @@ from typing import Any
 import jax
 import numpy as np
 
-from jaxlidar._files import atomic_write
 from jaxlidar._fingerprint import version_of
 from jaxlidar._registry import save_result
-from jaxlidar.instrument.photon_counter import PhotonEvents
 from jaxlidar.io.case import Case
 from jaxlidar.io.case import read_case as read_case_text
 from jaxlidar.io.datasets import (
@@ -26,10 +24,12 @@ from jaxlidar.io.datasets import (
     keep_as_netcdf,
     result_of,
 )
+from jaxlidar.io.files import atomic_write
 from jaxlidar.io.groups import StoredGroups, is_result_file, open_groups, write_groups
 from jaxlidar.io.store import replacing
+from jaxlidar.sensors.photon_counter import PhotonEvents
+from jaxlidar.simulation.truth import Truth
 from jaxlidar.spectral.waveform import Waveform
-from jaxlidar.truth import Truth
 
 CONVENTIONS = "CF-1.11"
 # The attribute with the number of the format of files. A reader refuses others: version 0.2 wrote format 1.

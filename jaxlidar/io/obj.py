@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from jaxlidar._checks import check_choice, check_number
+from jaxlidar._fields.checks import check_choice, check_number
 from jaxlidar.io.checks import MAX_COORDINATE
 from jaxlidar.io.coordinates import unit_length
 from jaxlidar.io.text import parse_integer, parse_number, read_lines

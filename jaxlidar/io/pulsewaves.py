@@ -30,7 +30,7 @@ from typing import Any, BinaryIO, NamedTuple, TypeVar, final
 import numpy as np
 from jaxtyping import Bool
 
-from jaxlidar._checks import warn_user
+from jaxlidar._fields.checks import warn_user
 from jaxlidar.io.airborne import AirborneShots, Scanner, Segment, evenly_spaced
 from jaxlidar.io.checks import MAX_COORDINATE, FileWarning, existing_file
 from jaxlidar.io.coordinates import (

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jaxlidar._checks import check_number, warn_user
+from jaxlidar._fields.checks import check_number, warn_user
 from jaxlidar.io.checks import MAX_COORDINATE, FileWarning, column_index
 from jaxlidar.io.coordinates import unit_length
 from jaxlidar.io.text import parse_integer, parse_number, read_lines, split_cells

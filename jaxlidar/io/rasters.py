@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import ArrayLike
 
-from jaxlidar._checks import as_numpy, check_kind, check_number, check_range, check_shape
-from jaxlidar._files import atomic_write
+from jaxlidar._fields.checks import as_numpy, check_kind, check_number, check_range, check_shape
 from jaxlidar.io.coordinates import import_rasterio, metric_system
+from jaxlidar.io.files import atomic_write
 
 _TIFF = (".tif", ".tiff")
 # Shots lie on a grid if they are off by less than this fraction of its spacing.

@@ -29,7 +29,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxlidar._checks import warn_user
+from jaxlidar._fields.checks import warn_user
 from jaxlidar.io.checks import DAMAGE_ERRORS
 
 _SUFFIX = ".zarr"

@@ -15,9 +15,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float, Shaped
 
-from jaxlidar._checks import check_choice, check_kind
-from jaxlidar._files import atomic_write
+from jaxlidar._fields.checks import check_choice, check_kind
 from jaxlidar._fingerprint import version_of
+from jaxlidar.io.files import atomic_write
 from jaxlidar.io.hdf5 import rows_in_order
 
 # Rows and columns that are printed, and the width of a printed column.

@@ -15,7 +15,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from jaxlidar._checks import is_traced, kind_of
+from jaxlidar._fields.checks import is_traced, kind_of
 from jaxlidar.io.kinds import (
     ALTERNATIVE_ARGUMENTS,
     Argument,

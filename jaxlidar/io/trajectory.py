@@ -9,12 +9,12 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from jaxlidar._checks import UnitWarning
-from jaxlidar._columns import warn_unread_columns
-from jaxlidar.instrument.trajectory import Trajectory
+from jaxlidar._fields.checks import UnitWarning
+from jaxlidar._fields.columns import warn_unread_columns
 from jaxlidar.io.checks import MAX_COORDINATE
 from jaxlidar.io.coordinates import metric_system, system_of_name, unit_angle, unit_length, units_agree
 from jaxlidar.io.text import parse_number, read_lines, split_cells
+from jaxlidar.sensors.trajectory import Trajectory
 
 # Names of columns in files, without case, spaces, underscores and units.
 _NAMES = {

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from jaxlidar._checks import check_choice, check_range, warn_user
+from jaxlidar._fields.checks import check_choice, check_range, warn_user
 from jaxlidar.io.checks import MAX_COORDINATE, FileWarning, column_index, max_unpacked_size
 from jaxlidar.io.coordinates import metric_system, unit_length
 from jaxlidar.io.text import parse_integer, parse_number, read_lines, split_cells

@@ -35,8 +35,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxlidar._checks import scalar
-from jaxlidar._ranges import Range, check_ranges
+from jaxlidar._fields.checks import scalar
+from jaxlidar._fields.ranges import Range, check_ranges
 from jaxlidar._vectors import Scalar, Vec, about, cross, dot, from_frame, polar, vec
 
 
@@ -138,7 +138,7 @@ class AbstractMirror(AbstractLaw):
 
     The lobe may be narrower than the angle between neighbouring rays of a footprint. The first return is
     therefore not computed from `intensity_factor`: it is integrated over beam, lobe and aperture, with a
-    Gaussian lobe of the standard deviation `roughness` (`jaxlidar.trace.mirror_return`).
+    Gaussian lobe of the standard deviation `roughness` (`trace.first.mirror_return`).
 
     A mirror of your own is one class in one file: derive it from this, and give the five methods of
     `AbstractLaw` and the field
@@ -235,7 +235,7 @@ def _square_of_sine(normal: Vec, out: Vec) -> Scalar:
 class Specular(AbstractMirror):
     """Specular reflection: a mirror of slightly tilted facets, with a Gaussian lobe about its direction.
 
-    The first return is exact for any roughness (see `jaxlidar.trace.mirror_return`). Paths of two or more
+    The first return is exact for any roughness (see `trace.first.mirror_return`). Paths of two or more
     scatterings that end at the mirror reach the receiver only within its lobe. They are unbiased, but so rare
     below a roughness of about 0.01 rad that few photons show one. The derivative of such paths with respect
     to the mirror's slope leaves out the rotation of the lobe.

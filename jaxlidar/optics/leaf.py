@@ -8,8 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from jaxlidar._checks import array
-from jaxlidar._ranges import FRACTION, SUM_OF_FRACTIONS, check_ranges
+from jaxlidar._fields.checks import array
+from jaxlidar._fields.ranges import FRACTION, SUM_OF_FRACTIONS, check_ranges
 
 
 @final

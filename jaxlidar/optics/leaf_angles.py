@@ -29,9 +29,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxlidar._checks import array, as_scalar, check_choice, check_range, concrete
-from jaxlidar._products import matmul
-from jaxlidar._ranges import Range, check_ranges
+from jaxlidar._fields.checks import array, as_scalar, check_choice, check_range, concrete
+from jaxlidar._fields.ranges import Range, check_ranges
+from jaxlidar._jax.products import matmul
 
 # Cells of inclination, one degree wide; nodes of |cos zenith| of the tables of G.
 ANGLE_CELLS = 90

@@ -27,7 +27,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import ArrayLike
 
-from jaxlidar._checks import as_numpy, check_number, check_range
+from jaxlidar._fields.checks import as_numpy, check_number, check_range
 
 # Gauss-Legendre nodes and weights on [0, 1].
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(32)

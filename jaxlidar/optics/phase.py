@@ -23,8 +23,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxlidar._checks import array, scalar
-from jaxlidar._ranges import FRACTION, Range, check_ranges
+from jaxlidar._fields.checks import array, scalar
+from jaxlidar._fields.ranges import FRACTION, Range, check_ranges
 from jaxlidar._vectors import Scalar, Vec, dot, from_frame, polar
 
 # Pi times the density 1/(4 pi) of isotropic scattering.

@@ -31,7 +31,7 @@ Multiplied by V = v^M, with g = v/t and W = (1 - V^2)/(1 - v^2), so that V S = g
 *Numerics.* Nothing here is a difference of close numbers, so that all three are accurate from transparent
 plates (A = 0: V = 1, W = M) to opaque ones. Single precision needs more: V = v^M magnifies the rounding of
 beta by M beta, which reaches 80. There v is corrected and beta carried with twice the digits
-(`jaxlidar._double_single`). The derivatives are those of these expressions, put into the same form
+(`jaxlidar.optics.double_single`). The derivatives are those of these expressions, put into the same form
 (`_slopes_k`, `_slopes_M`): the textbook's a, b and their square root are not differentiable at A = 0, while
 the result is.
 """
@@ -46,11 +46,10 @@ import numpy as np
 from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, ArrayLike, Bool, Float
 
-from jaxlidar import _double_single as double_single
-from jaxlidar import _expint
-from jaxlidar._checks import check_numbers
-from jaxlidar._double_single import DoubleSingle
-from jaxlidar._one_function import once
+from jaxlidar._fields.checks import check_numbers
+from jaxlidar._jax.one_function import once
+from jaxlidar.optics import double_single, expint
+from jaxlidar.optics.double_single import DoubleSingle
 from jaxlidar.optics.leaf_surface import LeafSurface
 
 _Reals = Float[Array, "..."]
@@ -181,7 +180,7 @@ class _PileState(NamedTuple):
 def _state(k: _Reals, M: _Reals, face: LeafSurface, kappa: DoubleSingle | None) -> _PileState:
     """Evaluate plate and pile: the equations of the module's docstring from top to bottom."""
     # The barriers keep the compiler from computing these again for every output (twice as fast on the CPU).
-    tau, omega = once((_expint.tau(k), _expint.omega(k)))
+    tau, omega = once((expint.tau(k), expint.omega(k)))
     q, p = face.t21 + face.r21 * omega, 1 + face.r21 * tau
     inside = face.t21 * tau / (q * p)
     t, Ta = face.t12 * inside, face.t_alpha * inside
@@ -199,7 +198,7 @@ def _state(k: _Reals, M: _Reals, face: LeafSurface, kappa: DoubleSingle | None) 
     fine_beta = None
     if kappa is not None:
         # The corrected values replace those of single precision; derivatives are of the latter.
-        scaled_v = face.t12 * face.t21 * _expint.scaled_tau(k) / (q * p) * g
+        scaled_v = face.t12 * face.t21 * expint.scaled_tau(k) / (q * p) * g
         (fine_w, fine_v), fine_beta = double_single.refine_decay(
             *jax.lax.stop_gradient((k, w, scaled_v, kappa))
         )
@@ -341,7 +340,7 @@ def _slopes_k(x: _PileState, k: _Reals, M: _Reals, face: LeafSurface) -> Triple:
     3. The leaf, by the product rule.
     """
     r, t, A, g, v, V, W, per_D = x.r, x.t, x.A, x.g, x.v, x.V, x.W, 1 / x.D
-    log_tau = _expint.log_slope(k)
+    log_tau = expint.log_slope(k)
     rho = face.r21 * x.tau
     log_t = log_tau * (1 + rho * rho) / (x.q * x.p)
     dt, dr, dA = t * log_t, rho * t * (log_t + log_tau), -log_tau * t * x.p / x.q
@@ -391,7 +390,7 @@ def _scaled_psi(a: _Reals, decay: _Reals, one_minus_decay2: _Reals) -> _Reals:
     Here and below, a Taylor series in a^2 below a = 1.5, where the difference would lose digits.
     """
     is_near, z, inverse = _series_or_closed_form(a)
-    series = _expint.polynomial(z, [(2 * j + 2) / math.factorial(2 * j + 3) for j in range(_n_terms(a))])
+    series = expint.polynomial(z, [(2 * j + 2) / math.factorial(2 * j + 3) for j in range(_n_terms(a))])
     closed = (1 - one_minus_decay2 / 2 - one_minus_decay2 / 2 * inverse) * (inverse * inverse)
     return jnp.where(is_near, decay * series, closed)
 
@@ -399,7 +398,7 @@ def _scaled_psi(a: _Reals, decay: _Reals, one_minus_decay2: _Reals) -> _Reals:
 def _scaled_phi(a: _Reals, decay: _Reals, one_minus_decay2: _Reals) -> _Reals:
     """exp(-a) (sinh(a)/a - 1)/a^2, with the same arguments."""
     is_near, z, inverse = _series_or_closed_form(a)
-    series = _expint.polynomial(z, [1 / math.factorial(2 * j + 3) for j in range(_n_terms(a))])
+    series = expint.polynomial(z, [1 / math.factorial(2 * j + 3) for j in range(_n_terms(a))])
     closed = (one_minus_decay2 / 2 * inverse - decay) * (inverse * inverse)
     return jnp.where(is_near, decay * series, closed)
 
@@ -408,7 +407,7 @@ def _langevin(a: _Reals, a_coth: _Reals) -> _Reals:
     """(a coth a - 1)/a^2, given `a_coth` = a coth a; for small a by Lambert's continued fraction in a^2."""
     is_near, z, inverse = _series_or_closed_form(a)
     numerator, denominator = _LAMBERT[a.dtype == jnp.float64]
-    fraction = _expint.polynomial(z, numerator) / _expint.polynomial(z, denominator)
+    fraction = expint.polynomial(z, numerator) / expint.polynomial(z, denominator)
     return jnp.where(is_near, fraction, (a_coth - 1) * (inverse * inverse))
 
 

@@ -40,7 +40,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Float
 
-from jaxlidar._checks import (
+from jaxlidar._fields.checks import (
     as_numpy,
     as_scalar,
     check_choice,
@@ -52,9 +52,9 @@ from jaxlidar._checks import (
     concrete,
     warn_units,
 )
-from jaxlidar._one_function import once
-from jaxlidar._products import tensordot
-from jaxlidar._ranges import Range, check_ranges
+from jaxlidar._fields.ranges import Range, check_ranges
+from jaxlidar._jax.one_function import once
+from jaxlidar._jax.products import tensordot
 from jaxlidar.optics.coefficients import TRAITS, Coefficients, shipped
 from jaxlidar.optics.leaf_surface import LeafSurface, leaf_surface
 from jaxlidar.optics.plate_model import plate_model, plate_model_slopes

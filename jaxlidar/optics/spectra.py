@@ -29,7 +29,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from jaxlidar._checks import (
+from jaxlidar._fields.checks import (
     array,
     as_array,
     check_choice,
@@ -39,7 +39,7 @@ from jaxlidar._checks import (
     scalar,
     warn_units,
 )
-from jaxlidar._ranges import FRACTION, SUM_OF_FRACTIONS, Range, check_ranges
+from jaxlidar._fields.ranges import FRACTION, SUM_OF_FRACTIONS, Range, check_ranges
 
 # The largest wavelength, nm, that is finite in single precision.
 _LARGEST_SINGLE = float(np.finfo(np.float32).max)

@@ -42,11 +42,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxlidar._checks import concrete_array, concrete_number
 from jaxlidar._constants import SPEED_OF_LIGHT
+from jaxlidar._fields.checks import concrete_array, concrete_number
 from jaxlidar._vectors import Vec, scale, vec
-from jaxlidar.instrument.field_of_view import visible_fraction
-from jaxlidar.instrument.lidar import Lidar, tan_half
 from jaxlidar.optics.facets import FACET_BACKSCATTER
 from jaxlidar.optics.laws import AbstractLaw, AbstractMirror
 from jaxlidar.optics.phase import AbstractPhase
@@ -55,6 +53,8 @@ from jaxlidar.planning.config import TimeBins
 from jaxlidar.scenes.canopy import Canopy
 from jaxlidar.scenes.scene import Scene
 from jaxlidar.scenes.surfaces import AbstractSheet, AbstractSurface
+from jaxlidar.sensors.field_of_view import visible_fraction
+from jaxlidar.sensors.lidar import Lidar, tan_half
 
 PerWavelength = Float[np.ndarray, "wavelengths"]
 Rays = Float[np.ndarray, "rays 3"]

@@ -12,13 +12,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxlidar._checks import concrete, fixed_array
-from jaxlidar.instrument.lidar import Lidar
+from jaxlidar._fields.checks import concrete, fixed_array
 from jaxlidar.optics.phase import AbstractPhase
 from jaxlidar.optics.spectra import reflectance_at
 from jaxlidar.planning.config import Scatterer
 from jaxlidar.scenes.scene import Scene
 from jaxlidar.scenes.surfaces import AbstractSheet, check_sum
+from jaxlidar.sensors.lidar import Lidar
 
 
 class MaterialOptics(NamedTuple):

@@ -3,7 +3,7 @@
 Compiled programs depend on everything in a `TraceConfig`: names, switches, sizes of loops and arrays; and on
 the sizes of `TimeBins`. The numbers in `PathLimits`, and the start and the width of `TimeBins`, are arguments
 of these programs, so that another height or window compiles nothing. A `Plan` holds all three with Python
-numbers; a `jaxlidar.trace.device_scene.DeviceScene` holds the latter two with JAX arrays.
+numbers; a `trace.device_scene.DeviceScene` holds the latter two with JAX arrays.
 """
 
 import dataclasses

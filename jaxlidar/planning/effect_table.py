@@ -6,11 +6,9 @@ from collections.abc import Callable, Sequence
 
 import jax
 
-from jaxlidar._checks import concrete_number, is_traced
 from jaxlidar._constants import SPEED_OF_LIGHT
+from jaxlidar._fields.checks import concrete_number, is_traced
 from jaxlidar._summary import percent
-from jaxlidar.instrument.field_of_view import EDGE_WIDTH
-from jaxlidar.instrument.lidar import Lidar
 from jaxlidar.planning.bounds import Bounds
 from jaxlidar.planning.config import TimeBins
 from jaxlidar.planning.effects import (
@@ -23,6 +21,8 @@ from jaxlidar.planning.effects import (
 from jaxlidar.planning.orders import OrderChoice
 from jaxlidar.scenes.scene import Scene
 from jaxlidar.scenes.surfaces import Ground
+from jaxlidar.sensors.field_of_view import EDGE_WIDTH
+from jaxlidar.sensors.lidar import Lidar
 
 # Reasons why effects are off that the user has not switched off.
 _REASONS_TO_LEAVE_OUT = {"relief": "the terrain is a plane", "meshes": "met by no ray of order one"}

@@ -12,14 +12,14 @@ from collections.abc import Mapping, Sequence
 import jax.numpy as jnp
 import numpy as np
 
-from jaxlidar._checks import concrete, concrete_number
-from jaxlidar.instrument.lidar import Lidar
+from jaxlidar._fields.checks import concrete, concrete_number
 from jaxlidar.optics.laws import AbstractMirror
 from jaxlidar.scenes.canopy import Canopy
 from jaxlidar.scenes.scene import Scene
 from jaxlidar.scenes.shapes import Plane
 from jaxlidar.scenes.surfaces import AbstractGround, Ground
 from jaxlidar.scenes.terrain import Terrain
+from jaxlidar.sensors.lidar import Lidar
 
 # In the order of the table. Each can be switched off.
 EFFECT_NAMES = (

@@ -11,9 +11,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from jaxlidar._checks import concrete
-from jaxlidar.instrument.lidar import Lidar
+from jaxlidar._fields.checks import concrete
 from jaxlidar.scenes.scene import Scene
+from jaxlidar.sensors.lidar import Lidar
 
 
 def move_aim_to_origin(lidar: Lidar, scene: Scene) -> tuple[Lidar, Scene]:

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 
 import jax.numpy as jnp
 
-from jaxlidar._memory import format_bytes, machine_memory
+from jaxlidar._jax.memory import format_bytes, machine_memory
 from jaxlidar.planning.config import TimeBins, TraceConfig
 from jaxlidar.scenes.mesh_surface import MeshSurface
 from jaxlidar.scenes.triangle_tree import ROW
@@ -31,7 +31,7 @@ _STATE_NUMBERS = 16
 # Footprint rays that are marched at once.
 _RAYS_AT_ONCE = 512
 # Tables with a number for each column and voxel: slopes of leaf, of bark, and of the optical depth above, and
-# the columns' numbers (`jaxlidar.trace.extinction_slopes.ExtinctionSlopes`).
+# the columns' numbers (`trace.derivatives.extinction_slopes.ExtinctionSlopes`).
 _SLOPE_TABLES = 4
 # Tables of the trees of meshes that are alive at once.
 _TREE_COPIES = 2

@@ -19,8 +19,8 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from jaxlidar._checks import concrete, concrete_array, fixed_array
 from jaxlidar._constants import SPEED_OF_LIGHT
+from jaxlidar._fields.checks import concrete, concrete_array, fixed_array
 from jaxlidar.planning.channels import MaterialOptics, largest_albedo
 from jaxlidar.planning.effects import allows_interreflection
 from jaxlidar.planning.size_buckets import size_bucket

@@ -4,9 +4,9 @@ import math
 
 import numpy as np
 
-from jaxlidar._checks import concrete_number
 from jaxlidar._constants import SPEED_OF_LIGHT
-from jaxlidar.instrument.survey import Survey
+from jaxlidar._fields.checks import concrete_number
+from jaxlidar.sensors.survey import Survey
 
 
 def parallel_light_bound(survey: Survey, start_distance: float, last_return: float) -> float:

@@ -14,7 +14,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
-from jaxlidar._checks import (
+from jaxlidar._fields.checks import (
     array_namespace,
     concrete,
     concrete_array,
@@ -23,8 +23,6 @@ from jaxlidar._checks import (
     is_traced,
 )
 from jaxlidar._vectors import FAR, vec
-from jaxlidar.instrument.lidar import AIM_DISTANCE, Lidar
-from jaxlidar.instrument.survey import Survey
 from jaxlidar.planning.config import KERNEL_BINS
 from jaxlidar.planning.size_buckets import size_bucket
 from jaxlidar.scenes.height_field import HeightField
@@ -33,6 +31,8 @@ from jaxlidar.scenes.scene import Scene
 from jaxlidar.scenes.shapes import Plane
 from jaxlidar.scenes.surfaces import AbstractSheet, AbstractSurface
 from jaxlidar.scenes.terrain import Terrain
+from jaxlidar.sensors.lidar import AIM_DISTANCE, Lidar
+from jaxlidar.sensors.survey import Survey
 
 # Least distance, m, of a sensor from a surface, and least angle, degrees, of its beam from the level within a
 # canopy that has no sides.

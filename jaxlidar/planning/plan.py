@@ -7,7 +7,8 @@ from typing import Any, NamedTuple
 
 import jax
 
-from jaxlidar._checks import (
+from jaxlidar._constants import SPEED_OF_LIGHT
+from jaxlidar._fields.checks import (
     check_choice,
     check_integer,
     check_kind,
@@ -16,10 +17,7 @@ from jaxlidar._checks import (
     concrete_array,
     concrete_number,
 )
-from jaxlidar._constants import SPEED_OF_LIGHT
-from jaxlidar._memory import format_bytes
-from jaxlidar.instrument.lidar import Lidar
-from jaxlidar.instrument.survey import Survey
+from jaxlidar._jax.memory import format_bytes
 from jaxlidar.optics.laws import AbstractMirror
 from jaxlidar.planning.channels import (
     ScattererChannels,
@@ -69,6 +67,8 @@ from jaxlidar.planning.record_times import bins_and_samples, extend_to_air_retur
 from jaxlidar.planning.size_buckets import size_bucket
 from jaxlidar.scenes.scene import Scene, check_kinds
 from jaxlidar.scenes.surfaces import AbstractSheet
+from jaxlidar.sensors.lidar import Lidar
+from jaxlidar.sensors.survey import Survey
 
 DEFAULT_RTOL = 0.01
 # Fewer batches give no trustworthy standard error.

@@ -14,9 +14,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool
 
-from jaxlidar._checks import concrete_number, fixed_array, is_traced
 from jaxlidar._constants import SPEED_OF_LIGHT
-from jaxlidar.instrument.lidar import Lidar
+from jaxlidar._fields.checks import concrete_number, fixed_array, is_traced
 from jaxlidar.optics.laws import AbstractMirror
 from jaxlidar.planning.channels import largest_albedo, scene_optics
 from jaxlidar.planning.effects import consists_of_planes, find_empty_materials, without_effects
@@ -32,6 +31,7 @@ from jaxlidar.planning.plan import Plan
 from jaxlidar.scenes.scene import Scene
 from jaxlidar.scenes.surfaces import AbstractSheet
 from jaxlidar.scenes.terrain import Terrain
+from jaxlidar.sensors.lidar import Lidar
 
 # Lengths and times may differ by the rounding of single precision.
 _ROUNDING = 1e-5

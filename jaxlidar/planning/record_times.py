@@ -4,12 +4,12 @@ import dataclasses
 import math
 from typing import NamedTuple
 
-from jaxlidar._checks import check_number, check_numbers, check_shape, concrete_number
 from jaxlidar._constants import SPEED_OF_LIGHT
-from jaxlidar.instrument.lidar import Lidar
+from jaxlidar._fields.checks import check_number, check_numbers, check_shape, concrete_number
 from jaxlidar.planning.config import KERNEL_BINS, TimeBins
 from jaxlidar.planning.path_lengths import PathLengths
 from jaxlidar.scenes.scene import Scene
+from jaxlidar.sensors.lidar import Lidar
 
 
 class SampleTimes(NamedTuple):

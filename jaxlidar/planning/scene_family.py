@@ -14,15 +14,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxlidar._checks import check_kind
-from jaxlidar.instrument.lidar import Lidar
-from jaxlidar.instrument.survey import Survey
+from jaxlidar._fields.checks import check_kind
 from jaxlidar.planning.effects import effects_of_family
 from jaxlidar.planning.memory import MAX_APPLIED_WAVELENGTHS, transformed_bytes
 from jaxlidar.planning.path_lengths import PathLengths
 from jaxlidar.planning.plan import Plan, plan
 from jaxlidar.planning.size_buckets import size_bucket
 from jaxlidar.scenes.scene import Scene, check_kinds
+from jaxlidar.sensors.lidar import Lidar
+from jaxlidar.sensors.survey import Survey
 
 
 def union_plan(

@@ -8,15 +8,15 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from jaxlidar._checks import check_kind, is_traced
-from jaxlidar._ranges import inadmissible
-from jaxlidar.instrument.lidar import Lidar
+from jaxlidar._fields.checks import check_kind, is_traced
+from jaxlidar._fields.ranges import inadmissible
 from jaxlidar.planning.effects import without_effects
 from jaxlidar.planning.local_origin import move_aim_to_origin
 from jaxlidar.planning.plan import Plan
 from jaxlidar.planning.plan_check import is_covered
 from jaxlidar.scenes.scene import Scene, check_kinds
 from jaxlidar.scenes.terrain import Terrain
+from jaxlidar.sensors.lidar import Lidar
 
 
 @final

@@ -1,8 +1,6 @@
 """Scene and lidar of `jaxlidar demo`: a tree 15 m tall on bare soil, under one large footprint."""
 
-from jaxlidar._checks import check_number
-from jaxlidar.instrument.lidar import Lidar
-from jaxlidar.instrument.pulse import GaussianPulse
+from jaxlidar._fields.checks import check_number
 from jaxlidar.optics.prospect import Prospect
 from jaxlidar.optics.spectra import spectrum
 from jaxlidar.plants.habits import grow
@@ -11,6 +9,8 @@ from jaxlidar.scenes.canopy import Canopy
 from jaxlidar.scenes.scene import Scene
 from jaxlidar.scenes.surfaces import Ground
 from jaxlidar.scenes.voxels import VoxelMap
+from jaxlidar.sensors.lidar import Lidar
+from jaxlidar.sensors.pulse import GaussianPulse
 
 # Height of the tree, m; one-sided area of all its leaves, m2; wavelengths of its lidar, nm.
 HEIGHT = 15.0

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from jaxlidar._checks import (
+from jaxlidar._fields.checks import (
     check_integer,
     check_kind,
     check_number,

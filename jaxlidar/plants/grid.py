@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from jaxlidar._checks import check_integer, check_range, check_shape
+from jaxlidar._fields.checks import check_integer, check_range, check_shape
 
 # Tolerance, in voxels, for coordinates that rounding has moved across a face of the grid.
 _ROUNDING = 1e-9

@@ -25,7 +25,7 @@ from typing import Any, final
 
 import numpy as np
 
-from jaxlidar._checks import (
+from jaxlidar._fields.checks import (
     check_integer,
     check_kind,
     check_number,

@@ -7,8 +7,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from jaxlidar._checks import check_integer, check_kind, check_seed, kind_of
-from jaxlidar._columns import warn_unread_columns
+from jaxlidar._fields.checks import check_integer, check_kind, check_seed, kind_of
+from jaxlidar._fields.columns import warn_unread_columns
 from jaxlidar.plants.forest import MAX_TREE_HEIGHT
 from jaxlidar.plants.habits import Habit, broadleaf, conifer, grow, shrub, spreading_tree
 from jaxlidar.plants.stand import Stand

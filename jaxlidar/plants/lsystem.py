@@ -23,7 +23,7 @@ from typing import Any, NamedTuple, final
 import numpy as np
 from jaxtyping import Float, Int, UInt32
 
-from jaxlidar._checks import check_flag, check_integer, check_kind, check_number, check_seed, kind_of
+from jaxlidar._fields.checks import check_flag, check_integer, check_kind, check_number, check_seed, kind_of
 
 # A run of letters without parameters, or one letter with its parameters (in a rule's successor: arrays).
 Item = str | tuple[Any, ...]

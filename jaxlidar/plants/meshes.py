@@ -20,7 +20,7 @@ from typing import final
 import numpy as np
 from jaxtyping import ArrayLike, Bool, Float, Int
 
-from jaxlidar._checks import (
+from jaxlidar._fields.checks import (
     check_integer,
     check_kind,
     check_number,

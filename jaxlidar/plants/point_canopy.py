@@ -42,7 +42,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy import ndimage, spatial
 
-from jaxlidar._checks import check_kind, check_range, check_shape
+from jaxlidar._fields.checks import check_kind, check_range, check_shape
 from jaxlidar.optics.leaf_angles import LeafAngles
 from jaxlidar.plants.grid import Grid, voxel_edges
 from jaxlidar.plants.point_cloud import PointCloud

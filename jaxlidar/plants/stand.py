@@ -7,7 +7,7 @@ from typing import Any, final, overload
 import numpy as np
 from jaxtyping import Float, Int
 
-from jaxlidar._checks import check_kind, check_number, check_range, check_shape
+from jaxlidar._fields.checks import check_kind, check_number, check_range, check_shape
 from jaxlidar.plants.tree import Tree
 from jaxlidar.scenes.terrain import Terrain
 

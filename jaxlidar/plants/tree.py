@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy import spatial
 
-from jaxlidar._checks import check_kind, check_number, check_range, check_shape
+from jaxlidar._fields.checks import check_kind, check_number, check_range, check_shape
 
 
 @final

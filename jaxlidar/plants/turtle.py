@@ -26,7 +26,7 @@ from math import cos, radians, sin, sqrt
 
 import numpy as np
 
-from jaxlidar._checks import check_kind, check_number, check_range, check_shape
+from jaxlidar._fields.checks import check_kind, check_number, check_range, check_shape
 from jaxlidar.plants.lsystem import Word
 from jaxlidar.plants.tree import Tree
 

@@ -29,7 +29,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from jaxlidar._checks import (
+from jaxlidar._fields.checks import (
     check_choice,
     check_integer,
     check_kind,

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 
-from jaxlidar._checks import as_numpy, check_kind
+from jaxlidar._fields.checks import as_numpy, check_kind
 from jaxlidar.plot.style import OTHER_COLOUR, TOTAL_COLOUR, WAVELENGTH_COLOURS
 
 # Axes beside one another, and the size of one in inches.

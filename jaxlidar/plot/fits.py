@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import ArrayLike
 from matplotlib.axes import Axes
 
-from jaxlidar._checks import as_numpy, check_number
+from jaxlidar._fields.checks import as_numpy, check_number
 from jaxlidar.plot.style import (
     TOTAL_COLOUR,
     WAVELENGTH_COLOURS,

@@ -6,10 +6,10 @@ import numpy as np
 from jaxtyping import ArrayLike
 from matplotlib.axes import Axes
 
-from jaxlidar._checks import check_kind, check_range, check_shape, concrete_array
-from jaxlidar.instrument.photon_counter import PhotonEvents
+from jaxlidar._fields.checks import check_kind, check_range, check_shape, concrete_array
 from jaxlidar.io.icesat2 import PhotonTrack
 from jaxlidar.plot.style import MATERIAL_COLOURS, OTHER_COLOUR, TOTAL_COLOUR, make_axes
+from jaxlidar.sensors.photon_counter import PhotonEvents
 
 # Name, colour and size in points of each label, in the order of drawing: noise lies below the others.
 _LABELS = {

@@ -8,7 +8,7 @@ from jaxtyping import ArrayLike, Float
 from matplotlib.axes import Axes
 from matplotlib.ticker import MaxNLocator
 
-from jaxlidar._checks import as_numpy
+from jaxlidar._fields.checks import as_numpy
 from jaxlidar.plot.style import MATERIAL_COLOURS, TOTAL_COLOUR, WAVELENGTH_COLOURS, make_axes
 
 # Opacity of the band, and colour of a product.

@@ -13,9 +13,7 @@ from matplotlib.axes import Axes
 from matplotlib.ticker import MaxNLocator
 from mpl_toolkits.mplot3d import Axes3D, proj3d
 
-from jaxlidar._checks import check_choice, check_kind, check_number, check_range, check_shape
-from jaxlidar.instrument.lidar import Lidar
-from jaxlidar.instrument.survey import Survey
+from jaxlidar._fields.checks import check_choice, check_kind, check_number, check_range, check_shape
 from jaxlidar.plants.point_cloud import PointCloud
 from jaxlidar.plot.style import (
     MATERIAL_COLOURS,
@@ -27,6 +25,8 @@ from jaxlidar.plot.style import (
 )
 from jaxlidar.scenes.scene import Scene
 from jaxlidar.scenes.terrain import Terrain
+from jaxlidar.sensors.lidar import Lidar
+from jaxlidar.sensors.survey import Survey
 from jaxlidar.survey.coverage import ground_position
 from jaxlidar.survey.returns import DiscreteReturns
 

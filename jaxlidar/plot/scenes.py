@@ -11,11 +11,11 @@ from matplotlib.axes import Axes
 from matplotlib.collections import PolyCollection
 from matplotlib.colors import LinearSegmentedColormap
 
-from jaxlidar.instrument.lidar import Lidar
 from jaxlidar.plot.style import BEAM_COLOUR, MATERIAL_COLOURS, make_axes
 from jaxlidar.scenes.scene import Scene
 from jaxlidar.scenes.surfaces import AbstractGround, AbstractSheet, AbstractSurface
 from jaxlidar.scenes.terrain import Terrain
+from jaxlidar.sensors.lidar import Lidar
 
 
 def scene(

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import ArrayLike
 from matplotlib.axes import Axes
 
-from jaxlidar._checks import as_numpy
+from jaxlidar._fields.checks import as_numpy
 from jaxlidar.optics.leaf import LeafOptics
 from jaxlidar.optics.prospect import Prospect
 from jaxlidar.optics.spectra import Spectrum

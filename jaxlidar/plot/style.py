@@ -12,7 +12,7 @@ from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.ticker import MaxNLocator
 
-from jaxlidar._checks import check_kind, check_number
+from jaxlidar._fields.checks import check_kind, check_number
 from jaxlidar.spectral.waveform import Waveform
 from jaxlidar.survey.waveforms import Waveforms
 

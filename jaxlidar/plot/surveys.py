@@ -8,12 +8,12 @@ from matplotlib.axes import Axes
 from matplotlib.collections import EllipseCollection
 from matplotlib.colors import LightSource, LinearSegmentedColormap
 
-from jaxlidar._checks import as_numpy, check_kind, check_range, check_shape
-from jaxlidar.instrument.scan import MAX_ZENITH
-from jaxlidar.instrument.survey import Survey
+from jaxlidar._fields.checks import as_numpy, check_kind, check_range, check_shape
 from jaxlidar.plot.style import BEAM_COLOUR, MATERIAL_COLOURS, label_map, make_axes
 from jaxlidar.scenes.scene import Scene
 from jaxlidar.scenes.terrain import Terrain
+from jaxlidar.sensors.scan import MAX_ZENITH
+from jaxlidar.sensors.survey import Survey
 from jaxlidar.survey.coverage import ground_position
 
 # Footprints smaller than this fraction of the figure are drawn as dots.

@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from mpl_toolkits.mplot3d import Axes3D, proj3d
 from mpl_toolkits.mplot3d.art3d import Line3DCollection
 
-from jaxlidar._checks import check_number
+from jaxlidar._fields.checks import check_number
 from jaxlidar.plants.tree import Tree
 from jaxlidar.plot.style import MATERIAL_COLOURS
 

@@ -7,7 +7,7 @@ from jaxtyping import ArrayLike, Float
 from matplotlib.axes import Axes
 from matplotlib.patches import Patch
 
-from jaxlidar._checks import (
+from jaxlidar._fields.checks import (
     as_numpy,
     check_choice,
     check_kind,

@@ -13,9 +13,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray, UInt32
 
-from jaxlidar._checks import is_traced
-from jaxlidar._programs import Program
-from jaxlidar._threads import ONE_CORE
+from jaxlidar._fields.checks import is_traced
+from jaxlidar._jax.programs import Program
+from jaxlidar._jax.threads import ONE_CORE
 from jaxlidar.planning.setup import Setup
 from jaxlidar.spectral.apply_optics import (
     WaveformModel,

@@ -15,8 +15,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from jaxlidar._products import matmul
-from jaxlidar._programs import Program
+from jaxlidar._jax.products import matmul
+from jaxlidar._jax.programs import Program
 from jaxlidar.sampling.errors import relative_error, student_widening
 from jaxlidar.sampling.moments import RunningMoments, scaled_deviation
 from jaxlidar.spectral.apply_optics import WaveformModel

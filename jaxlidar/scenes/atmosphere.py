@@ -40,7 +40,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
-from jaxlidar._checks import (
+from jaxlidar._fields.checks import (
     as_array,
     as_scalar,
     check_choice,
@@ -50,7 +50,7 @@ from jaxlidar._checks import (
     scalar,
     warn_units,
 )
-from jaxlidar._ranges import Range, check_ranges
+from jaxlidar._fields.ranges import Range, check_ranges
 from jaxlidar._text import object_text
 
 # Admissible wavelengths, nm. Peck and Reeder's formula is fitted to 230..1690 nm and smooth far beyond; the

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from jaxlidar._checks import (
+from jaxlidar._fields.checks import (
     check_choice,
     check_flag,
     check_kind,
@@ -23,7 +23,7 @@ from jaxlidar._checks import (
     concrete,
     kind_of,
 )
-from jaxlidar._ranges import FRACTION
+from jaxlidar._fields.ranges import FRACTION
 from jaxlidar._text import object_text
 from jaxlidar.optics.phase import AbstractPhase
 from jaxlidar.optics.spectra import Spectrum, reflectance_at

@@ -35,11 +35,11 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxlidar._checks import array_namespace, fixed_array
-from jaxlidar._mesh_axes import vary_together
-from jaxlidar._one_function import once
+from jaxlidar._fields.checks import array_namespace, fixed_array
+from jaxlidar._jax.mesh_axes import vary_together
+from jaxlidar._jax.one_function import once
+from jaxlidar._jax.vmapped_loops import any_problem
 from jaxlidar._vectors import FAR, Scalar, Vec, along, dot, normalise, vec, with_derivative_of
-from jaxlidar._vmapped_loops import any_problem
 from jaxlidar.scenes.raster import Cell, Raster
 from jaxlidar.scenes.shapes import AbstractShape
 

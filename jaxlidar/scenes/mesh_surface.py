@@ -17,7 +17,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
-from jaxlidar._checks import (
+from jaxlidar._fields.checks import (
     as_array,
     as_numpy,
     as_scalar,
@@ -32,8 +32,8 @@ from jaxlidar._checks import (
     is_traced,
     kind_of,
 )
-from jaxlidar._products import einsum, matmul
-from jaxlidar._ranges import SUM_OF_FRACTIONS, Range, check_ranges
+from jaxlidar._fields.ranges import SUM_OF_FRACTIONS, Range, check_ranges
+from jaxlidar._jax.products import einsum, matmul
 from jaxlidar._vectors import FAR, Scalar, Vec, along, dot, vec
 from jaxlidar.optics.laws import AbstractLaw, AbstractMirror, Lambertian
 from jaxlidar.optics.spectra import Spectrum

@@ -3,7 +3,7 @@
 import jax
 import numpy as np
 
-from jaxlidar._checks import concrete, warn_user
+from jaxlidar._fields.checks import concrete, warn_user
 from jaxlidar._summary import NOTABLE_FRACTION, percent
 from jaxlidar.scenes.canopy import Canopy
 from jaxlidar.scenes.surfaces import AbstractGround

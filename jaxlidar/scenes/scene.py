@@ -10,11 +10,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxlidar._checks import check_kind, concrete, concrete_array, is_traced, kind_of
-from jaxlidar._ranges import Range
+from jaxlidar._fields.checks import check_kind, concrete, concrete_array, is_traced, kind_of
+from jaxlidar._fields.ranges import Range
 from jaxlidar._text import object_text
 from jaxlidar._vectors import FAR
-from jaxlidar.instrument.lidar import Lidar
 from jaxlidar.scenes.atmosphere import Atmosphere
 from jaxlidar.scenes.canopy import Canopy
 from jaxlidar.scenes.mesh_surface import MeshSurface
@@ -23,6 +22,7 @@ from jaxlidar.scenes.shapes import Plane
 from jaxlidar.scenes.surfaces import AbstractGround, AbstractSheet, AbstractSurface
 from jaxlidar.scenes.terrain import Terrain
 from jaxlidar.scenes.voxels import VoxelMap
+from jaxlidar.sensors.lidar import Lidar
 
 # Smallest distance, m, between parallel planes. In single precision closer ones coincide, and it is not
 # defined which of them a ray meets first.
@@ -110,7 +110,7 @@ class Scene(eqx.Module):
     def _check_plates(self) -> None:
         """Refuse plates in the plane of triangles of a mesh, or of cells of a terrain.
 
-        Triangles that lie in the ground are met before it (`jaxlidar.trace.meshes`).
+        Triangles that lie in the ground are met before it (`trace.march.meshes`).
         """
         if not self.plates or any(
             is_traced(x) for x in jax.tree.leaves((self.plates, self.ground, self.meshes))

@@ -7,7 +7,7 @@ from typing import final
 import numpy as np
 from jaxtyping import Float
 
-from jaxlidar._checks import as_numpy, check_kind, check_range
+from jaxlidar._fields.checks import as_numpy, check_kind, check_range
 from jaxlidar.scenes.scene import Scene
 
 

@@ -21,7 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from jaxlidar._checks import array_namespace, as_array, as_scalar, fixed_array
+from jaxlidar._fields.checks import array_namespace, as_array, as_scalar, fixed_array
 from jaxlidar._vectors import FAR, Scalar, Vec, dot, vec
 
 # Rays whose cosine with the normal is smaller than this are taken as parallel and do not meet the plane.
@@ -115,7 +115,7 @@ class AbstractShape(eqx.Module):
 
         The return jumps where rays come to meet the shape or to miss it. Derivatives of the first order, and
         of the first flight of photons, take that in by this distance (see
-        `jaxlidar.trace.reparametrisation`); flights after a scattering leave it out.
+        `trace.derivatives.reparametrisation`); flights after a scattering leave it out.
 
         **Arguments:**
 

@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxlidar._checks import (
+from jaxlidar._fields.checks import (
     as_array,
     as_numpy,
     check_choice,
@@ -30,7 +30,7 @@ from jaxlidar._checks import (
     coordinates,
     scalar,
 )
-from jaxlidar._ranges import FRACTION, SUM_OF_FRACTIONS, Range, check_ranges
+from jaxlidar._fields.ranges import FRACTION, SUM_OF_FRACTIONS, Range, check_ranges
 from jaxlidar._text import object_text
 from jaxlidar.optics.laws import AbstractLaw, Lambertian
 from jaxlidar.optics.spectra import Spectrum

@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from jaxlidar._checks import (
+from jaxlidar._fields.checks import (
     array,
     as_array,
     as_numpy,
@@ -33,7 +33,7 @@ from jaxlidar._checks import (
     concrete_array,
     coordinates,
 )
-from jaxlidar._ranges import FRACTION, Range, check_ranges
+from jaxlidar._fields.ranges import FRACTION, Range, check_ranges
 from jaxlidar._vectors import normalise
 from jaxlidar.optics.laws import AbstractLaw, AbstractMirror, Lambertian
 from jaxlidar.optics.spectra import Spectrum

@@ -40,8 +40,8 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxlidar._mesh_axes import vary_with
-from jaxlidar._one_function import once, one_function
+from jaxlidar._jax.mesh_axes import vary_with
+from jaxlidar._jax.one_function import once, one_function
 from jaxlidar._vectors import FAR, Scalar, Vec, cross, dot, scale, vec, with_derivative_of
 
 # Numbers in a row of the table.

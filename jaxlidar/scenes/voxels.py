@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from jaxlidar._checks import (
+from jaxlidar._fields.checks import (
     as_array,
     check_kind,
     check_range,
@@ -26,7 +26,7 @@ from jaxlidar._checks import (
     coordinates,
     warn_units,
 )
-from jaxlidar._ranges import Range, check_ranges
+from jaxlidar._fields.ranges import Range, check_ranges
 from jaxlidar._text import object_text
 from jaxlidar.optics.leaf_angles import LeafAngles
 from jaxlidar.scenes.terrain import Terrain

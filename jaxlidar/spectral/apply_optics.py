@@ -22,17 +22,17 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from jaxlidar._checks import as_array
 from jaxlidar._constants import SPEED_OF_LIGHT
-from jaxlidar._products import einsum
-from jaxlidar._programs import Program
-from jaxlidar.instrument.lidar import Lidar
+from jaxlidar._fields.checks import as_array
+from jaxlidar._jax.products import einsum
+from jaxlidar._jax.programs import Program
 from jaxlidar.planning.channels import channel_optics
 from jaxlidar.planning.config import KERNEL_VARIANCE
 from jaxlidar.planning.effects import allows_interreflection
 from jaxlidar.planning.setup import Setup
 from jaxlidar.planning.size_buckets import size_bucket
 from jaxlidar.scenes.atmosphere import Atmosphere
+from jaxlidar.sensors.lidar import Lidar
 from jaxlidar.spectral.pivot_wavelengths import PivotWavelengths, find_pivots
 from jaxlidar.spectral.pulse_convolution import (
     FreeSamplingConvolution,
@@ -40,7 +40,7 @@ from jaxlidar.spectral.pulse_convolution import (
     free_sampling_convolution,
     pulse_convolution,
 )
-from jaxlidar.trace.histories import Histories, histories
+from jaxlidar.trace.photons.histories import Histories, histories
 from jaxlidar.trace.response import Response
 
 # Programs have room for at least so many wavelengths.
@@ -399,7 +399,7 @@ def _sum_orders(
 def derivatives_to_samples(
     fine: Float[Array, "columns wavelengths bins"], model: WaveformModel
 ) -> Float[Array, "columns wavelengths samples"]:
-    """Return derivatives of `total_samples` from those in fine bins (see `jaxlidar.trace.response`)."""
+    """Return derivatives of `total_samples` from those in fine bins (see `trace.response`)."""
     if model.transmittance is not None:
         fine = fine * model.transmittance[None]
     return model.admissible * model.convolution(fine)

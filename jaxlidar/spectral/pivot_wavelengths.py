@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from jaxlidar._products import einsum
+from jaxlidar._jax.products import einsum
 
 # Random polynomials that sample the matrix.
 _N_POLYNOMIALS = 64

@@ -7,7 +7,7 @@ A return in the fine bin at t_i adds to the sample at t_s, of the width D, the f
 which depends on t_s - t_i alone. It is applied as a matrix of fine bins and samples where that is small, or
 as a band: samples in tiles, each of which takes from two blocks of fine bins, by one matrix for all tiles.
 
-Deposits were spread by a kernel (`jaxlidar.trace.deposit`) of the second moment v = 1/4 bin^2
+Deposits were spread by a kernel (`trace.deposit`) of the second moment v = 1/4 bin^2
 (`KERNEL_VARIANCE`). It is taken out again to second order, F - v/2 F'', by fluxes that are limited so that no
 fraction becomes negative (as those of Boris and Book 1973, J. Comput. Phys. 11, 38). Where the pulse is
 smooth on the scale of a fine bin, the error left is of fourth order in the bin's width.
@@ -21,15 +21,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxlidar._checks import as_array
-from jaxlidar._one_function import once
-from jaxlidar._products import einsum
-from jaxlidar._programs import Program
-from jaxlidar.instrument.lidar import Lidar
-from jaxlidar.instrument.pulse import AbstractPulse
+from jaxlidar._fields.checks import as_array
+from jaxlidar._jax.one_function import once
+from jaxlidar._jax.products import einsum
+from jaxlidar._jax.programs import Program
 from jaxlidar.planning.config import KERNEL_VARIANCE
 from jaxlidar.planning.memory import MAX_DENSE_PULSE, band_size
 from jaxlidar.planning.plan import Plan
+from jaxlidar.sensors.lidar import Lidar
+from jaxlidar.sensors.pulse import AbstractPulse
 
 
 @final

@@ -18,12 +18,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxlidar._checks import check_range, is_traced
+from jaxlidar._fields.checks import check_range, is_traced
 from jaxlidar._registry import detect_returns, save_result, true_returns, waveform_html
 from jaxlidar._summary import summary
-from jaxlidar.instrument.lidar import Lidar
-from jaxlidar.instrument.receiver import Receiver, digitise, first_return_window
 from jaxlidar.planning.setup import Setup
+from jaxlidar.sensors.lidar import Lidar
+from jaxlidar.sensors.receiver import Receiver, digitise, first_return_window
 from jaxlidar.spectral.apply_optics import (
     WaveformModel,
     budget_terms,

@@ -6,10 +6,10 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float, Int
 
-from jaxlidar._checks import concrete_array, concrete_number
-from jaxlidar.instrument.lidar import Lidar
-from jaxlidar.instrument.survey import Survey
+from jaxlidar._fields.checks import concrete_array, concrete_number
 from jaxlidar.io.datasets import keep_as_netcdf
+from jaxlidar.sensors.lidar import Lidar
+from jaxlidar.sensors.survey import Survey
 
 # Samples of the pulse per sample of the digitiser: crossings of a level are interpolated between them.
 PULSE_OVERSAMPLING = 8

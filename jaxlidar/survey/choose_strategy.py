@@ -4,11 +4,9 @@ import math
 
 import numpy as np
 
-from jaxlidar._checks import concrete_array, concrete_number
 from jaxlidar._constants import SPEED_OF_LIGHT
+from jaxlidar._fields.checks import concrete_array, concrete_number
 from jaxlidar._summary import percent
-from jaxlidar.instrument.lidar import AIM_DISTANCE
-from jaxlidar.instrument.survey import Survey
 from jaxlidar.optics.laws import AbstractMirror
 from jaxlidar.planning.local_origin import move_aim_to_origin
 from jaxlidar.planning.parallel_light import beams_are_parallel, parallel_light_bound
@@ -17,6 +15,8 @@ from jaxlidar.planning.plan import plan as make_plan
 from jaxlidar.planning.setup import Setup, make_setup
 from jaxlidar.scenes.scene import Scene
 from jaxlidar.scenes.terrain import Terrain
+from jaxlidar.sensors.lidar import AIM_DISTANCE
+from jaxlidar.sensors.survey import Survey
 from jaxlidar.survey.footprint_splines import FootprintSplines, fit_footprints
 from jaxlidar.survey.node_groups import IlluminatedNodes, NodeGroup, illuminated_nodes, make_groups
 from jaxlidar.survey.per_shot import MAX_WAVELENGTHS_OF_NARROW, PerShotStrategy

@@ -13,14 +13,14 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from jaxlidar._checks import warn_user
+from jaxlidar._fields.checks import warn_user
 from jaxlidar._summary import NOTABLE_FRACTION, percent, unfollowed_message
 from jaxlidar.io.case import Case
 from jaxlidar.io.datasets import datasets_of
 from jaxlidar.io.groups import write_zarr_group
 from jaxlidar.io.netcdf import datasets_with_case
 from jaxlidar.io.store import ResultStore, consolidate, dataset_of_rows
-from jaxlidar.simulate import LateLightWarning, UnfollowedLightWarning
+from jaxlidar.simulation.one_scene import LateLightWarning, UnfollowedLightWarning
 from jaxlidar.spectral.apply_optics import make_waveform_model, refuse_excess
 from jaxlidar.survey.acquisition import Acquisition
 from jaxlidar.survey.results import ShotResults

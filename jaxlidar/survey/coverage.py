@@ -5,16 +5,16 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from jaxlidar._checks import as_array, check_kind
-from jaxlidar._programs import Program
+from jaxlidar._fields.checks import as_array, check_kind
+from jaxlidar._jax.programs import Program
 from jaxlidar._summary import NOTABLE_FRACTION, percent
 from jaxlidar._vectors import FAR, vec
-from jaxlidar.instrument.lidar import AIM_DISTANCE
-from jaxlidar.instrument.survey import Survey
 from jaxlidar.planning.size_buckets import size_bucket
 from jaxlidar.scenes.canopy import Canopy
 from jaxlidar.scenes.scene import Scene
 from jaxlidar.scenes.shapes import AbstractShape, Plane
+from jaxlidar.sensors.lidar import AIM_DISTANCE
+from jaxlidar.sensors.survey import Survey
 
 # Cosines of incidence below this count as along the ground.
 _LEAST_COSINE = 1e-6

@@ -33,8 +33,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from jaxlidar.instrument.survey import Survey
-from jaxlidar.trace.entry_nodes import cubic_bspline
+from jaxlidar.sensors.survey import Survey
+from jaxlidar.trace.photons.entry_nodes import cubic_bspline
 
 # Radius within which a Gaussian beam is followed, over its 1/e^2 radius; 4e-6 of its energy lies beyond.
 GAUSSIAN_EXTENT = 2.5

@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float, Int
 
 from jaxlidar.planning.size_buckets import size_bucket
 from jaxlidar.survey.footprint_splines import FootprintSplines
-from jaxlidar.trace.entry_nodes import RAYS_PER_GROUP
+from jaxlidar.trace.photons.entry_nodes import RAYS_PER_GROUP
 
 # Largest number of nodes of a group, and of photons and of rays of a batch if a group has several nodes: a
 # batch cannot be interrupted. A ray deposits light in every voxel that it crosses, a photon at two points of
@@ -37,7 +37,7 @@ class NodeGroup(NamedTuple):
     """Nodes that are traced together.
 
     - `aim`: (2,) position of the middle, m. - `node_position`: (nodes, 2) from there, m.
-    - `photons`, `rays`: allocated to the nodes, as in `jaxlidar.trace.entry_nodes.EntryNodes`.
+    - `photons`, `rays`: allocated to the nodes, as in `trace.photons.entry_nodes.EntryNodes`.
     - `shots`: numbers of the footprints with a coefficient in the group.
     - `coefficients`, `misplaced_energy`: (shots, nodes), as in `FootprintSplines`.
     - `has_centre`: (shots,) whether the node next to the footprint's centre is in the group: it is in one

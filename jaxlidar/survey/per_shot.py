@@ -17,7 +17,7 @@ one of two ways:
   A lattice of N = m N_0 rays is traced in m parts of N_0 rays, since compiled programs need fixed shapes.
 
 Lattices of narrow footprints begin with as few rays as the tolerance allows, and those of several shots are
-traced together (`jaxlidar.trace.lattices_of_shots`). The lattices of a shot interleave: together they are one
+traced together (`trace.first.lattices_of_shots`). The lattices of a shot interleave: together they are one
 lattice of eight times as many rays, which has no gaps. If a lattice of N rays has the error c N^-3/4, that of
 all eight is c (8 N)^-3/4. It is 8^-1/4 times what their scatter tells, c N^-3/4 8^-1/2, the standard error of
 the mean of eight independent ones. The former is reported where edges of voxels are few within a footprint,
@@ -35,15 +35,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
-from jaxlidar._programs import Program
-from jaxlidar._threads import ONE_CORE
-from jaxlidar._workers import WorkUnit, task
-from jaxlidar.instrument.survey import Survey
+from jaxlidar._jax.programs import Program
+from jaxlidar._jax.threads import ONE_CORE
+from jaxlidar._jax.workers import WorkUnit, task
 from jaxlidar.planning.plan import MIN_BATCHES
 from jaxlidar.planning.setup import Setup
 from jaxlidar.sampling.adaptive import StepRule, StoppingRule, sample_until_compiled
 from jaxlidar.sampling.errors import relative_error
 from jaxlidar.sampling.moments import RunningMoments
+from jaxlidar.sensors.survey import Survey
 from jaxlidar.spectral.apply_optics import (
     BudgetTerms,
     WaveformModel,
@@ -57,9 +57,9 @@ from jaxlidar.spectral.apply_optics import (
 from jaxlidar.survey.results import ShotErrors, ShotResults, make_shot_results
 from jaxlidar.survey.strategy import AbstractStrategy, Shots, first_rows, slices_of_shots
 from jaxlidar.trace.device_scene import DeviceScene, aim_at, build_device_scene
-from jaxlidar.trace.first_order import FirstOrderTally
-from jaxlidar.trace.footprint import RaySlice, interleaving_shifts, make_beam
-from jaxlidar.trace.lattices_of_shots import (
+from jaxlidar.trace.first.first_order import FirstOrderTally
+from jaxlidar.trace.first.footprint import RaySlice, interleaving_shifts, make_beam
+from jaxlidar.trace.first.lattices_of_shots import (
     LatticeParts,
     LatticeSums,
     add_parts,

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from jaxlidar._not_kept import NotKept
-from jaxlidar.instrument.receiver import digitise
+from jaxlidar.sensors.receiver import digitise
 from jaxlidar.spectral.apply_optics import BudgetTerms, WaveformModel, budget_excess
 from jaxlidar.spectral.waveform import energy_at_reference
 

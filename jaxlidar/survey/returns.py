@@ -44,7 +44,8 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Bool, Float, Int, Shaped
 
-from jaxlidar._checks import (
+from jaxlidar._constants import SPEED_OF_LIGHT
+from jaxlidar._fields.checks import (
     as_numpy,
     check_choice,
     check_integer,
@@ -53,14 +54,13 @@ from jaxlidar._checks import (
     check_numbers,
     check_range,
 )
-from jaxlidar._constants import SPEED_OF_LIGHT
 from jaxlidar._not_kept import NotKept
 from jaxlidar._progress import TaskProgress
 from jaxlidar._registry import decompose_records
-from jaxlidar.instrument.lidar import Lidar
-from jaxlidar.instrument.survey import Survey, beam_directions
 from jaxlidar.io.airborne import AirborneShot, Returns, Segment
 from jaxlidar.io.las import write_las
+from jaxlidar.sensors.lidar import Lidar
+from jaxlidar.sensors.survey import Survey, beam_directions
 from jaxlidar.survey.acquisition import PULSE_OVERSAMPLING, Acquisition, acquisition_of
 
 DETECTORS = ("peak", "constant fraction", "leading edge", "decomposition")

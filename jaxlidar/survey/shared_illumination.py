@@ -44,10 +44,10 @@ import numpy as np
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 from scipy import sparse
 
-from jaxlidar._checks import as_array
-from jaxlidar._programs import Program
-from jaxlidar._threads import ONE_CORE
-from jaxlidar._workers import WorkUnit, task
+from jaxlidar._fields.checks import as_array
+from jaxlidar._jax.programs import Program
+from jaxlidar._jax.threads import ONE_CORE
+from jaxlidar._jax.workers import WorkUnit, task
 from jaxlidar.planning.plan import MIN_BATCHES
 from jaxlidar.planning.setup import Setup
 from jaxlidar.sampling.adaptive import AbstractEstimate, EstimateErrors, StepRule, StoppingRule, sample_until
@@ -70,11 +70,15 @@ from jaxlidar.survey.results import ShotErrors, ShotResults, make_shot_results
 from jaxlidar.survey.strategy import AbstractStrategy, ContributionSum, Shots, slices_of_shots
 from jaxlidar.survey.view_geometry import ViewGeometry
 from jaxlidar.trace.device_scene import DeviceScene, aim_at, build_device_scene
-from jaxlidar.trace.entry_nodes import EntryNodes
-from jaxlidar.trace.footprint import parallel_beam
+from jaxlidar.trace.first.footprint import parallel_beam
+from jaxlidar.trace.first.shot_views import ShotViews
+from jaxlidar.trace.photons.entry_nodes import EntryNodes
+from jaxlidar.trace.photons.shared_illumination import (
+    trace_first_of_shots,
+    trace_nodes,
+    trace_shots,
+)
 from jaxlidar.trace.response import Response
-from jaxlidar.trace.shared_illumination import trace_first_of_shots, trace_nodes, trace_shots
-from jaxlidar.trace.shot_views import ShotViews
 
 # Coefficients of shots at nodes, or at shots, (shots, traced): a NumPy array, or a sparse one of SciPy.
 ShotCoefficients = Any

@@ -19,7 +19,7 @@ from typing import Any
 import jax
 from jaxtyping import PRNGKeyArray
 
-from jaxlidar._checks import (
+from jaxlidar._fields.checks import (
     check_choice,
     check_flag,
     check_integer,
@@ -30,14 +30,14 @@ from jaxlidar._checks import (
     warn_user,
 )
 from jaxlidar._fingerprint import fingerprint
+from jaxlidar._jax.workers import WorkUnit, outcomes
 from jaxlidar._progress import TaskProgress
 from jaxlidar._registry import simulate_survey
-from jaxlidar._workers import WorkUnit, outcomes
-from jaxlidar.instrument.survey import Survey
 from jaxlidar.io.case import Case, case_text
 from jaxlidar.io.store import check_store_path, open_store
 from jaxlidar.scenes.scene import Scene, check_kinds
 from jaxlidar.scenes.scene_parts import SceneParts
+from jaxlidar.sensors.survey import Survey
 from jaxlidar.survey.acquisition import acquisition_of
 from jaxlidar.survey.choose_strategy import choose_strategy
 from jaxlidar.survey.collect import StoredSurvey, SurveyResults, waveforms_in_memory

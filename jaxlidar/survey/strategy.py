@@ -9,9 +9,9 @@ import jax
 import numpy as np
 from jaxtyping import Int, PRNGKeyArray
 
-from jaxlidar._workers import WorkUnit
-from jaxlidar.instrument.survey import Survey
+from jaxlidar._jax.workers import WorkUnit
 from jaxlidar.planning.setup import Setup
+from jaxlidar.sensors.survey import Survey
 from jaxlidar.survey.results import ShotResults
 
 # Shots of a task: a slice, or their numbers.

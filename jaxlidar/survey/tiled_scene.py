@@ -26,10 +26,10 @@ from jaxtyping import Float, Int, PRNGKeyArray
 
 from jaxlidar._constants import SPEED_OF_LIGHT
 from jaxlidar._fingerprint import digest_of
-from jaxlidar._workers import WorkUnit, run_unit, task
-from jaxlidar.instrument.survey import Survey
+from jaxlidar._jax.workers import WorkUnit, run_unit, task
 from jaxlidar.scenes.scene import check_kinds
 from jaxlidar.scenes.scene_parts import SceneParts
+from jaxlidar.sensors.survey import Survey
 from jaxlidar.survey.choose_strategy import choose_strategy
 from jaxlidar.survey.collect import ShotsInMemory, SurveyResults
 from jaxlidar.survey.coverage import ground_heights, off_map

@@ -9,17 +9,17 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from jaxlidar._programs import Program
-from jaxlidar._threads import ONE_CORE
-from jaxlidar._workers import WorkUnit, task
+from jaxlidar._jax.programs import Program
+from jaxlidar._jax.threads import ONE_CORE
+from jaxlidar._jax.workers import WorkUnit, task
 from jaxlidar.io.datasets import keep_as_netcdf
 from jaxlidar.io.netcdf import TRUTH_QUANTITIES
 from jaxlidar.planning.setup import Setup
+from jaxlidar.simulation.truth import Truth, compute_labels, first_order_setup
 from jaxlidar.spectral.apply_optics import make_waveform_model
 from jaxlidar.survey.per_shot import ShotGeometry, aim_offset, setup_of_shot, shot_geometry
 from jaxlidar.survey.strategy import AbstractStrategy, ContributionSum, Shots, first_rows
 from jaxlidar.trace.device_scene import DeviceScene, aim_at, build_device_scene
-from jaxlidar.truth import Truth, compute_labels, first_order_setup
 
 
 @final

@@ -15,13 +15,13 @@ import numpy as np
 from jaxtyping import Float
 from scipy import spatial
 
-from jaxlidar._checks import concrete_number
-from jaxlidar.instrument.lidar import tan_half
-from jaxlidar.instrument.survey import Survey
+from jaxlidar._fields.checks import concrete_number
 from jaxlidar.planning.size_buckets import size_bucket
+from jaxlidar.sensors.lidar import tan_half
+from jaxlidar.sensors.survey import Survey
 from jaxlidar.survey.footprint_splines import BeamSection, section_of
 from jaxlidar.survey.node_groups import NodeGroup
-from jaxlidar.trace.shot_views import ShotViews
+from jaxlidar.trace.first.shot_views import ShotViews
 
 # Radius within which a field of view is followed, over its own; it sees 5e-5 of what lies beyond.
 _VIEW_EXTENT = 1.2
@@ -50,7 +50,7 @@ class ViewGeometry(NamedTuple):
     - `beam`: of all shots. - `position`: of the shots, m.
     - `view_radius`: of fields of view, m across the beam; None without limit.
     - `max_shots`, `max_central`: largest number of a group's shots, and of those whose centre is in it.
-    - `cell_shape`: (nx, ny, candidates), the shape of `candidates` in `jaxlidar.trace.shot_views.ShotViews`.
+    - `cell_shape`: (nx, ny, candidates), the shape of `candidates` in `trace.first.shot_views.ShotViews`.
     """
 
     beam: BeamSection

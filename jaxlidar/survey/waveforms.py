@@ -10,19 +10,19 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import ArrayLike, Float, Int
 
-from jaxlidar._checks import check_numbers
 from jaxlidar._constants import SPEED_OF_LIGHT
+from jaxlidar._fields.checks import check_numbers
 from jaxlidar._not_kept import NotKept
 from jaxlidar._progress import TaskProgress
 from jaxlidar._registry import detect_returns, true_returns
 from jaxlidar._summary import NOTABLE_FRACTION, percent
-from jaxlidar.instrument.lidar import Lidar
-from jaxlidar.instrument.survey import beam_directions
 from jaxlidar.io import netcdf
 from jaxlidar.io.case import Case
 from jaxlidar.io.datasets import datasets_of, keep_as_netcdf
 from jaxlidar.io.las_waveforms import write_las_waveforms
 from jaxlidar.sampling.adaptive import StopReason
+from jaxlidar.sensors.lidar import Lidar
+from jaxlidar.sensors.survey import beam_directions
 from jaxlidar.spectral.waveform import Waveform
 from jaxlidar.survey.acquisition import Acquisition
 from jaxlidar.survey.results import OPTIONAL_ARRAYS

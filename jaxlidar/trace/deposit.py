@@ -17,7 +17,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float, Int
 
-from jaxlidar._one_function import once
+from jaxlidar._jax.one_function import once
 from jaxlidar.planning.config import KERNEL_BINS, TimeBins
 
 

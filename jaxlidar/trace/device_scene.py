@@ -14,12 +14,12 @@ Throughout `jaxlidar.trace`:
     R, T            reflectance, transmittance of a material
     q               probability of sampling reflection rather than transmission
     channel         reflection, or transmission, by one material ("leaf.R"); no detector channel
-    history         number of scatterings by each channel along a path (`jaxlidar.trace.histories`)
+    history         number of scatterings by each channel along a path (`trace.photons.histories`)
     number          index of a law, material, surface, channel or history in the tuple or table of these
     lane            number of a photon in its batch, which its random numbers depend on
-    ratio           attached likelihood ratio: one in value, with a derivative (`jaxlidar.trace.photons`)
+    ratio           attached likelihood ratio: one in value, with a derivative (`trace.photons.photons`)
     parameter       theta_j of a Jacobian; "slopes" are derivatives with respect to the parameters
-                    (`jaxlidar.trace.extinction_slopes`), but `slope_x` and `slope_y` those of terrain
+                    (`trace.derivatives.extinction_slopes`), but `slope_x` and `slope_y` those of terrain
 """
 
 import dataclasses
@@ -30,9 +30,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from jaxlidar._programs import Program
+from jaxlidar._jax.programs import Program
 from jaxlidar._vectors import Scalar, Vec, vec
-from jaxlidar.instrument.lidar import Lidar
 from jaxlidar.optics.laws import AbstractLaw, Lambertian
 from jaxlidar.optics.phase import AbstractPhase
 from jaxlidar.planning.channels import channel_optics
@@ -40,13 +39,14 @@ from jaxlidar.planning.config import PathLimits, TimeBins, TraceConfig
 from jaxlidar.planning.setup import Setup
 from jaxlidar.scenes.mesh_surface import MeshTree, build_mesh_tree
 from jaxlidar.scenes.scene import Scene
-from jaxlidar.trace.extinction_slopes import ExtinctionSlopes
-from jaxlidar.trace.footprint import Beam, make_beam
-from jaxlidar.trace.histories import Histories, histories
-from jaxlidar.trace.photons import LastScattering, Photons
-from jaxlidar.trace.shot_views import ShotViews
-from jaxlidar.trace.surfaces import TracedSurface, traced_surfaces
-from jaxlidar.trace.voxel_traversal import Medium, VoxelBox, make_medium, occupied_box, vertical_depths
+from jaxlidar.sensors.lidar import Lidar
+from jaxlidar.trace.derivatives.extinction_slopes import ExtinctionSlopes
+from jaxlidar.trace.first.footprint import Beam, make_beam
+from jaxlidar.trace.first.shot_views import ShotViews
+from jaxlidar.trace.march.surfaces import TracedSurface, traced_surfaces
+from jaxlidar.trace.march.voxel_traversal import Medium, VoxelBox, make_medium, occupied_box, vertical_depths
+from jaxlidar.trace.photons.histories import Histories, histories
+from jaxlidar.trace.photons.photons import LastScattering, Photons
 
 # Index of the cosine law, by which facets, diffusely transmitting plates and most surfaces send light on.
 COSINE_LAW = 0

@@ -4,8 +4,8 @@
         response[bin, h] * prod over channels s of optics_s[wavelength] ** exponent[h, s]
 
 This is known in biomedical optics as white Monte Carlo (Alerstam et al. 2008). Order one is deterministic
-(`jaxlidar.trace.first_order`), orders two and above are a Monte Carlo estimate
-(`jaxlidar.trace.higher_orders`).
+(`trace.first.first_order`), orders two and above are a Monte Carlo estimate
+(`trace.photons.higher_orders`).
 
 Arrays have an axis `traces`, one run of the tracer for each: usually a single one, of all wavelengths; one
 for each wavelength where leaves transmit straight on, because extinction then depends on it; and one for each
@@ -21,20 +21,25 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from jaxlidar._checks import check_flag, check_key, check_kind
-from jaxlidar._mesh_axes import vary_together, vary_with, with_automatic_axes
-from jaxlidar._products import einsum, tensordot
+from jaxlidar._fields.checks import check_flag, check_key, check_kind
+from jaxlidar._jax.mesh_axes import vary_together, vary_with, with_automatic_axes
+from jaxlidar._jax.products import einsum, tensordot
 from jaxlidar.planning.setup import Setup
+from jaxlidar.trace.derivatives.first_order_replay import pull_back_first_order
+from jaxlidar.trace.derivatives.higher_order_replay import pull_back_higher_orders
+from jaxlidar.trace.derivatives.replay import ExtinctionTables, with_replay
 from jaxlidar.trace.device_scene import DeviceScene, build_device_scene
-from jaxlidar.trace.empty_voxels import add_tangents_of_empty_voxels
-from jaxlidar.trace.first_order import FirstOrder, first_order
-from jaxlidar.trace.first_order_replay import pull_back_first_order
-from jaxlidar.trace.footprint import ALL_RAYS, RaySlice, fibonacci_disc, product_rule
-from jaxlidar.trace.higher_order_replay import pull_back_higher_orders
-from jaxlidar.trace.higher_orders import HigherOrderTally, PhotonBatch, trace_higher_orders, trace_photons
-from jaxlidar.trace.mirror_return import mirror_rays
-from jaxlidar.trace.random_numbers import random_words, to_unit
-from jaxlidar.trace.replay import ExtinctionTables, with_replay
+from jaxlidar.trace.first.first_order import FirstOrder, first_order
+from jaxlidar.trace.first.footprint import ALL_RAYS, RaySlice, fibonacci_disc, product_rule
+from jaxlidar.trace.first.mirror_return import mirror_rays
+from jaxlidar.trace.march.empty_voxels import add_tangents_of_empty_voxels
+from jaxlidar.trace.photons.higher_orders import (
+    HigherOrderTally,
+    PhotonBatch,
+    trace_higher_orders,
+    trace_photons,
+)
+from jaxlidar.trace.photons.random_numbers import random_words, to_unit
 
 Traced = TypeVar("Traced")
 

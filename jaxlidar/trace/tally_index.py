@@ -16,7 +16,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxlidar._vectors import Scalar
 from jaxlidar.trace.device_scene import DeviceScene
-from jaxlidar.trace.photons import Photons, detach
+from jaxlidar.trace.photons.photons import Photons, detach
 
 
 class TallyIndex(eqx.Module):

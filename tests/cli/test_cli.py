@@ -181,7 +181,8 @@ def test_retrieve_finds_the_ground(tmp_path, capsys):
 def test_compiled_programs_are_stored_unless_refused(tmp_path):
     """In the user's cache folder; when the command has ended, JAX has its previous configuration."""
     code = (
-        "import sys, jax; from jaxlidar import _compilation_cache as cache; from jaxlidar.cli import main;"
+        "import sys, jax; from jaxlidar._jax import compilation_cache as cache;"
+        "from jaxlidar.cli import main;"
         "before = dict(jax.config.values);"
         # A fast machine compiles all programs of the command in less than the minimum time.
         "cache.MIN_COMPILE_TIME = 0.0;"

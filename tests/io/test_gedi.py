@@ -7,8 +7,8 @@ import warnings
 import numpy as np
 import pytest
 
-from jaxlidar.instrument.pulse import SampledPulse
 from jaxlidar.io import FileWarning, read_gedi_l1b
+from jaxlidar.sensors.pulse import SampledPulse
 
 h5py = pytest.importorskip("h5py")
 

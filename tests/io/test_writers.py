@@ -17,9 +17,9 @@ import pytest
 
 import inversion.demo
 import jaxlidar as jl
-from jaxlidar import _files, cli
+from jaxlidar import cli
 from jaxlidar.cli.shared import new_axes, save_figure
-from jaxlidar.io import atomic_write
+from jaxlidar.io import atomic_write, files
 from tests.io.test_las_waveforms import small_shots
 
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="links, pipes and modes of POSIX")
@@ -284,7 +284,7 @@ for _ in range(200):
 
 
 def test_processes_that_replace_one_folder_all_end_well(tmp_path):
-    arguments = [sys.executable, "-c", REPLACE_FOLDERS, _files.__file__, str(tmp_path / "store")]
+    arguments = [sys.executable, "-c", REPLACE_FOLDERS, files.__file__, str(tmp_path / "store")]
     processes = [subprocess.Popen(arguments, stdin=subprocess.PIPE, text=True) for _ in range(3)]
     for process in processes:
         process.stdin.write("start\n")

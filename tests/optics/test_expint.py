@@ -9,7 +9,7 @@ import mpmath
 import numpy as np
 import pytest
 
-from jaxlidar import _expint
+from jaxlidar.optics import expint
 from tests.helpers import BY_PRECISION
 
 EXACT = {
@@ -44,7 +44,7 @@ def relative_error(values, exact):
 @pytest.mark.parametrize("name", EXACT)
 def test_values_and_derivatives(name, precision):
     k = arguments(precision)
-    function = getattr(_expint, name)
+    function = getattr(expint, name)
     values, slopes = jax.jit(lambda k: jax.jvp(function, (k,), (jnp.ones_like(k),)))(jnp.asarray(k))
     assert values.dtype == precision
     with mpmath.workdps(40):
@@ -58,7 +58,7 @@ def test_values_and_derivatives(name, precision):
 @BY_PRECISION
 @pytest.mark.parametrize("name", EXACT)
 def test_zero_and_large_arguments(name, precision):
-    function = getattr(_expint, name)
+    function = getattr(expint, name)
     k = jnp.array([0.0, 1e3, 1e4])
     for f in (function, jax.vmap(jax.grad(function))):
         assert np.all(np.isfinite(f(k)[1:]))
@@ -70,6 +70,6 @@ def test_zero_and_large_arguments(name, precision):
 
 
 def test_second_derivative_of_tau(precision):
-    second = jax.vmap(jax.grad(jax.grad(_expint.tau)))(jnp.array([0.0, 1e-3, 0.5, 2.0]))
+    second = jax.vmap(jax.grad(jax.grad(expint.tau)))(jnp.array([0.0, 1e-3, 0.5, 2.0]))
     np.testing.assert_allclose(second[1:], [2 * float(mpmath.e1(x)) for x in (1e-3, 0.5, 2.0)], rtol=1e-6)
     assert np.isfinite(second[0])

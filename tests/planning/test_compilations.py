@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import jaxlidar as jl
-from jaxlidar._programs import Program
+from jaxlidar._jax.programs import Program
 from jaxlidar.planning.size_buckets import size_bucket
 from jaxlidar.sampling import batch_programs
 

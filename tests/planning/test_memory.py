@@ -24,7 +24,7 @@ from jaxlidar.sampling.batch_programs import make_batch_tracer
 from jaxlidar.spectral.pulse_convolution import PulseConvolution, pulse_convolution
 from jaxlidar.spectral.waveform import waveform_of_model
 from jaxlidar.trace.device_scene import build_device_scene
-from jaxlidar.trace.higher_orders import trace_higher_orders
+from jaxlidar.trace.photons.higher_orders import trace_higher_orders
 from tests.helpers import slab, slow_unless, with_applied_optics
 
 ROOT = Path(__file__).resolve().parents[2]

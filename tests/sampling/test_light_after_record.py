@@ -10,11 +10,11 @@ import pytest
 
 import jaxlidar as jl
 from jaxlidar.planning import orders
-from jaxlidar.simulate import LateLightWarning
+from jaxlidar.simulation.one_scene import LateLightWarning
 from tests.helpers import slab
 
 # The package's name `simulate` is the function.
-simulation = importlib.import_module("jaxlidar.simulate")
+simulation = importlib.import_module("jaxlidar.simulation.one_scene")
 KEY = jax.random.key(5)
 BRIGHT = jl.Scene(plates=(jl.Plate(80.0, 0.4, 0.5),), ground=jl.Ground(reflectance=0.9))
 LIDAR = jl.Lidar()

@@ -13,7 +13,7 @@ LIDAR = jl.Lidar()
 SCENE = jl.Scene(plates=(jl.Plate(5.0, 0.3, 0.3),), ground=jl.Ground())
 
 # `jaxlidar.simulate` is the function.
-simulation = importlib.import_module("jaxlidar.simulate")
+simulation = importlib.import_module("jaxlidar.simulation.one_scene")
 
 
 @pytest.fixture

@@ -11,7 +11,7 @@ import jaxlidar as jl
 from jaxlidar.sampling.waveform_moments import PivotMoments, WaveformMoments
 from jaxlidar.spectral.apply_optics import budget_terms, make_waveform_model, total_samples
 from jaxlidar.spectral.pivot_wavelengths import find_pivots
-from jaxlidar.trace.histories import histories
+from jaxlidar.trace.photons.histories import histories
 
 WAVELENGTH = np.arange(400.0, 2501.0)
 LEAF = jl.Prospect(N=1.5, Cab=40.0, Car=8.0, Cant=0.0, Cbrown=0.0, Cw=0.01, Cm=0.009)

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxlidar as jl
-from jaxlidar.trace.voxel_traversal import make_medium, march_to_depths
+from jaxlidar.trace.march.voxel_traversal import make_medium, march_to_depths
 from tests.helpers import SINGLE_SAMPLE, single_sample_lidar
 from tests.stability import hard_answers as answers
 

@@ -14,7 +14,7 @@ import pytest
 from jax.extend.core import ClosedJaxpr, Jaxpr
 
 import jaxlidar as jl
-from jaxlidar.instrument.receiver import first_return_window
+from jaxlidar.sensors.receiver import first_return_window
 
 FULL = (jax.lax.Precision.HIGHEST, jax.lax.Precision.HIGHEST)
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import jaxlidar as jl
-from jaxlidar._ranges import SUM_OF_FRACTIONS, is_outside
+from jaxlidar._fields.ranges import SUM_OF_FRACTIONS, is_outside
 from jaxlidar.extend import Range, inadmissible, reasons
 
 CUBE = np.full((2, 2, 2), 0.5)

@@ -12,9 +12,9 @@ import jaxlidar as jl
 from jaxlidar.survey.choose_strategy import choose_strategy
 from jaxlidar.survey.per_shot import aim_offset, setup_of_shot, shot_geometry, trace_chunk
 from jaxlidar.trace.device_scene import aim_at, build_device_scene
-from jaxlidar.trace.first_order import first_order
-from jaxlidar.trace.footprint import RaySlice, fibonacci_disc, interleaving_shifts, make_beam
-from jaxlidar.trace.lattices_of_shots import LatticeParts, add_parts, empty_tally, lattice_sums
+from jaxlidar.trace.first.first_order import first_order
+from jaxlidar.trace.first.footprint import RaySlice, fibonacci_disc, interleaving_shifts, make_beam
+from jaxlidar.trace.first.lattices_of_shots import LatticeParts, add_parts, empty_tally, lattice_sums
 from tests.helpers import BY_PRECISION
 
 KEY = jax.random.key(5)

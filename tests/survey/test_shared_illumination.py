@@ -7,7 +7,7 @@ import jaxlidar as jl
 from jaxlidar.survey.footprint_splines import BeamSection, fit_footprints, section_of, spline_error
 from jaxlidar.survey.results import OPTIONAL_ARRAYS
 from jaxlidar.survey.shared_illumination import GroupContribution, make_group_context, sum_contributions
-from jaxlidar.trace.entry_nodes import cubic_bspline
+from jaxlidar.trace.photons.entry_nodes import cubic_bspline
 from tests.survey.test_simulate_many import (
     FAST,
     KEY,

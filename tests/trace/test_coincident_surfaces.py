@@ -149,7 +149,7 @@ def test_an_energy_budget_of_more_than_the_light_is_an_error(monkeypatch):
         refuse_excess(np.array([0.0, 0.15]))
     refuse_excess(np.array([-1.0, 0.0]))
     # Planted: every run looks at its budget.
-    for module in ("jaxlidar.simulate", "jaxlidar.energy", "jaxlidar.survey.collect"):
+    for module in ("jaxlidar.simulation.one_scene", "jaxlidar.simulation.energy", "jaxlidar.survey.collect"):
         # By its name in `sys.modules`: `jaxlidar.simulate` is also a function.
         monkeypatch.setattr(
             sys.modules[module], "refuse_excess", lambda excess: refuse_excess(np.asarray(excess) + 1.0)

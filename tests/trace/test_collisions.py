@@ -12,9 +12,9 @@ import pytest
 
 import jaxlidar as jl
 from jaxlidar.extend import vec
-from jaxlidar.trace.collisions import sample_collision
 from jaxlidar.trace.device_scene import build_device_scene
-from jaxlidar.trace.random_numbers import PhotonDraws
+from jaxlidar.trace.photons.collisions import sample_collision
+from jaxlidar.trace.photons.random_numbers import PhotonDraws
 from tests.helpers import agrees, slab
 
 COUNT = 1 << 16

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 import jaxlidar as jl
-from jaxlidar.trace.compaction import SHORT_PATH, compact
 from jaxlidar.trace.device_scene import build_device_scene
-from jaxlidar.trace.photons import Photons
-from jaxlidar.trace.voxel_traversal import enter_grid
+from jaxlidar.trace.march.voxel_traversal import enter_grid
+from jaxlidar.trace.photons.compaction import SHORT_PATH, compact
+from jaxlidar.trace.photons.photons import Photons
 
 
 def photons(alive):

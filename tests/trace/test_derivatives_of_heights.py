@@ -6,7 +6,7 @@ the sum of the waveform and its first moment in time. Automatic differentiation 
 differences, both as means over independent keys, at Sidak's level of 1 in 1,000 for both functionals.
 
 The planted fault lets photons that collide on their way to a surface take part in the motion of landings: the
-derivative then lacks what crosses the longest flight (`jaxlidar.trace.reparametrisation`).
+derivative then lacks what crosses the longest flight (`jaxlidar.trace.derivatives.reparametrisation`).
 
 Invariances need no differences: ground and canopy that rise together shift time alone, a canopy that moves
 sideways over a periodic scene changes nothing, and lengths that grow with extinction falling as their inverse
@@ -24,8 +24,8 @@ from scipy.stats import norm
 
 import jaxlidar as jl
 from jaxlidar._vectors import FAR
-from jaxlidar.trace import higher_orders
-from jaxlidar.trace.voxel_traversal import march_to_depths
+from jaxlidar.trace.march.voxel_traversal import march_to_depths
+from jaxlidar.trace.photons import higher_orders
 from tests.helpers import slow_unless
 
 KEYS = 16

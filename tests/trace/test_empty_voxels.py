@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 import jaxlidar as jl
-from jaxlidar.trace import higher_order_replay
+from jaxlidar.trace.derivatives import higher_order_replay
 from jaxlidar.trace.device_scene import build_device_scene
-from jaxlidar.trace.empty_voxels import EmptyVoxels
+from jaxlidar.trace.march.empty_voxels import EmptyVoxels
 from tests.helpers import agrees
 
 RANDOM = np.random.default_rng(0)

@@ -78,8 +78,8 @@ def traced(lidar, scene, plan, key):
 @pytest.mark.slow
 def test_the_chunk_size_does_not_matter(reference_wave, monkeypatch):
     plan, wave = reference_wave
-    monkeypatch.setattr("jaxlidar.trace.higher_orders.PHOTONS_PER_CHUNK", 96)
-    monkeypatch.setattr("jaxlidar.trace.first_order.RAYS_AT_ONCE", 100)
+    monkeypatch.setattr("jaxlidar.trace.photons.higher_orders.PHOTONS_PER_CHUNK", 96)
+    monkeypatch.setattr("jaxlidar.trace.first.first_order.RAYS_AT_ONCE", 100)
     # Two functions, so that JAX compiles each with its chunk size.
     trace_small_chunks = eqx.filter_jit(lambda *arguments: traced(*arguments))
     lidar, scene = build()

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import jaxlidar as jl
-from jaxlidar.trace.voxel_traversal import make_medium, march_to_depths, occupied_box
+from jaxlidar.trace.march.voxel_traversal import make_medium, march_to_depths, occupied_box
 
 RAYS, STEP = 500, 1e-7
 

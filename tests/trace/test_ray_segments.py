@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 import jaxlidar as jl
-from jaxlidar.trace import ray_segments
 from jaxlidar.trace.device_scene import build_device_scene
+from jaxlidar.trace.march import ray_segments
 from jaxlidar.trace.response import trace_device_scene
 from tests.helpers import slow_unless
 

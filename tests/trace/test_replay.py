@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import jaxlidar as jl
-from jaxlidar.trace import higher_order_replay, replay
+from jaxlidar.trace.derivatives import higher_order_replay, replay
 from jaxlidar.trace.device_scene import build_device_scene
 from tests.helpers import agrees
 

@@ -16,10 +16,10 @@ import pytest
 
 import jaxlidar as jl
 from jaxlidar.spectral.apply_optics import derivatives_to_samples, make_waveform_model, setup_optics
-from jaxlidar.trace import higher_orders
+from jaxlidar.trace.derivatives.score_functions import make_slopes
 from jaxlidar.trace.device_scene import build_device_scene
+from jaxlidar.trace.photons import higher_orders
 from jaxlidar.trace.response import trace_with_scores
-from jaxlidar.trace.score_functions import make_slopes
 from tests.helpers import BY_PRECISION
 
 RANDOM = np.random.default_rng(5)

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import jaxlidar as jl
-from jaxlidar.instrument.lidar import tan_half
+from jaxlidar.sensors.lidar import tan_half
 from tests.helpers import agrees, slab, slow_unless
 from tests.scenes.test_outlines import SPHERE, Sphere
 

@@ -1,0 +1,1 @@
+"""Around JAX: compiled programs, their cache, threads and workers, loops and products of matrices."""

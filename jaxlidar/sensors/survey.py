@@ -1,0 +1,674 @@
+"""Surveys: one lidar and many shots, each with its position and direction.
+
+A survey stores for each shot the zenith and azimuth of the beam, and its place in one of two ways, as a
+`Lidar` does: by where the beam axis meets the reference plane z = 0 and the altitude of the sensor above
+that, or by the position of the sensor. A beam of the direction w from the sensor s, at the height H = s_z,
+meets the reference plane at
+
+    p = (s_x, s_y) - H (w_x, w_y) / w_z,   zenith = atan2(hypot(w_x, w_y), -w_z),   azimuth = atan2(w_x, w_y).
+
+How a scanner on a moving platform comes to s and w is in `jaxlidar.instrument.trajectory`. Positions stay in
+double precision, as map coordinates of millions of metres need.
+"""
+
+import dataclasses
+import math
+import operator
+from typing import Any, final
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import ArrayLike, Float, Int
+
+from jaxlidar._fields.checks import (
+    as_numpy,
+    check_integer,
+    check_kind,
+    check_number,
+    check_range,
+    concrete_array,
+    concrete_number,
+    warn_unit,
+)
+from jaxlidar._jax.memory import format_bytes, machine_memory
+from jaxlidar._text import number_text
+from jaxlidar.sensors.lidar import AIM_DISTANCE, STRAIGHT_UP, Lidar
+from jaxlidar.sensors.scan import MAX_ZENITH, AbstractScan
+from jaxlidar.sensors.trajectory import Trajectory, rotation_matrix, three_numbers
+
+# A length that falls short of a multiple of the spacing by this fraction, as by rounding, counts as the
+# multiple.
+_SPACING_TOLERANCE = 1e-6
+# Point clouds number flight lines with 16 bits.
+MAX_FLIGHT_LINE = 2**16 - 1
+# Bytes of a shot while a survey is made: its position and direction, and the terms of their sums.
+_BYTES_PER_SHOT = 100.0
+# More positions along a line than fit into any memory.
+_LARGEST_COUNT = 1e30
+
+
+@final
+class Survey(eqx.Module):
+    """Many shots of one lidar: the place and direction of each.
+
+    `Survey.grid`, `Survey.track`, `Survey.scan` and `Survey.fly` make surveys. `len(survey)` is the number of
+    shots, `survey[i]` the `Lidar` of shot i, and `survey[a:b]` the survey of some of them. Positions are kept
+    in double precision.
+
+    **Arguments:**
+
+    - `lidar`: the `Lidar` of all shots. Its own place is not used.
+    - `position`: (shots, 2) x and y in m where the beam axis meets the reference plane z = 0. Default None:
+      by `sensor`.
+    - `zenith`: angle between the beam and straight down in degrees, in [0, 89], or in [0, 180] with `sensor`;
+      one number or (shots,). Default None: the lidar's.
+    - `azimuth`: compass direction in which the beam travels in degrees, one number or (shots,). Default None:
+      the lidar's.
+    - `altitude`: height of the sensor above the reference plane in m, positive, one number or (shots,), with
+      `position`. Default None: the lidar's.
+    - `sensor`: (shots, 3) x, y and z of the sensor in m, in place of `position`: anywhere. Time zero of every
+      shot is then its emission. Default None.
+    - `gps_time`: (shots,) s, as point clouds have it: seconds of the GPS week, or adjusted standard GPS time
+      (GPS time less 1e9 s). Default None: not known.
+    - `scan_angle`: (shots,) angle of the beam to the right of the track in degrees, in [-180, 180]. Default
+      None: not known.
+    - `flight_line`: number of the flight line, an integer in [0, 65535], one number or (shots,). Default
+      None: not known.
+
+    **Raises:** ValueError for arrays of other shapes, no shot at all, values outside their ranges, and a
+    sensor together with a position or an altitude; TypeError for objects of the wrong type.
+
+    **Example:**
+
+    >>> import jaxlidar as jl
+    >>> survey = jl.Survey(jl.Lidar(altitude=500.0), position=[(0, 0), (10, 0), (20, 0)], zenith=[0, 5, 10])
+    >>> len(survey), float(survey[1].zenith), survey[1].position.tolist()
+    (3, 5.0, [10.0, 0.0])
+    >>> terrestrial = jl.Survey(jl.Lidar(), sensor=[(0, 0, 1.5)] * 3, zenith=[60, 90, 120], azimuth=45.0)
+    >>> terrestrial[2].sensor.tolist()
+    [0.0, 0.0, 1.5]
+    """
+
+    lidar: Lidar
+    # (shots, 2) aim points on the reference plane, or (shots, 3) sensors.
+    position: Float[np.ndarray, "shots axes"]
+    zenith: Float[np.ndarray, " shots"]
+    azimuth: Float[np.ndarray, " shots"]
+    altitude: Float[np.ndarray, " shots"] | None
+    gps_time: Float[np.ndarray, " shots"] | None
+    scan_angle: Float[np.ndarray, " shots"] | None
+    flight_line: Int[np.ndarray, " shots"] | None
+
+    def __init__(
+        self,
+        lidar: Lidar,
+        position: Any = None,
+        zenith: ArrayLike | Any | None = None,
+        azimuth: ArrayLike | Any | None = None,
+        altitude: ArrayLike | Any | None = None,
+        sensor: Any = None,
+        *,
+        gps_time: ArrayLike | Any | None = None,
+        scan_angle: ArrayLike | Any | None = None,
+        flight_line: ArrayLike | Any | None = None,
+    ):
+        check_kind("lidar", lidar, Lidar, "a Lidar, as in Survey(Lidar(), position=...)")
+        position = _place(lidar, position, altitude, sensor)
+        shots = len(position)
+        has_sensors = position.shape[1] == 3
+        # Not `==`, which compares arrays.
+        if altitude is None and not has_sensors:
+            altitude = lidar.altitude
+            if altitude is None:
+                raise ValueError(
+                    "position is given, but the lidar has no altitude; admissible is sensor, or altitude"
+                )
+        self.position = position
+        self.altitude = None if altitude is None else _per_shot("altitude", altitude, shots)
+        if self.altitude is not None:
+            check_range("altitude", self.altitude, 0.0, low_open=True)
+        # The lidar is of the same kind as its shots, so that these share its compiled programs.
+        self.lidar = _of_kind(lidar, has_sensors)
+        self.zenith = _per_shot("zenith", lidar.zenith if zenith is None else zenith, shots)
+        self.azimuth = _per_shot("azimuth", lidar.azimuth if azimuth is None else azimuth, shots)
+        check_range("zenith", self.zenith, 0.0, STRAIGHT_UP if has_sensors else MAX_ZENITH)
+        self.gps_time = _optional_per_shot("gps_time", gps_time, shots)
+        self.scan_angle = _optional_per_shot("scan_angle", scan_angle, shots)
+        lines = _optional_per_shot("flight_line", flight_line, shots)
+        if self.scan_angle is not None:
+            check_range("scan_angle", self.scan_angle, -180.0, 180.0)
+        if lines is not None:
+            check_range("flight_line", lines, 0, MAX_FLIGHT_LINE)
+            if np.any(lines != np.floor(lines)):
+                raise ValueError("flight_line has values that are not whole numbers")
+        self.flight_line = None if lines is None else lines.astype(int)
+
+    def __len__(self) -> int:
+        return len(self.position)
+
+    def __str__(self) -> str:
+        coordinates = zip("xyz", self.position.T, "mmm")
+        columns = (*coordinates, ("zenith", self.zenith, ""))
+        spans = ", ".join(
+            f"{name} {number_text(a.min())} to {number_text(a.max())} {unit}" for name, a, unit in columns
+        )
+        return f"Survey of {len(self):,} shots: {spans}degrees\n{self.lidar}"
+
+    def __getitem__(self, shot: int | slice) -> "Lidar | Survey":
+        if isinstance(shot, slice):
+            return self.subset(shot)
+        i = self._index(shot)
+        return self._lidar_at(self.position[i], i)
+
+    def __iter__(self):
+        return (self[i] for i in range(len(self)))
+
+    def subset(self, shots: slice | Int[np.ndarray, " chosen"]) -> "Survey":
+        """Return the survey of some shots: a slice, or their numbers."""
+
+        def rows(a: np.ndarray | None) -> np.ndarray | None:
+            return None if a is None else a[shots]
+
+        fields = ("zenith", "azimuth", "altitude", "gps_time", "scan_angle", "flight_line")
+        place = {"sensor" if self.has_sensor_position else "position": self.position[shots]}
+        return Survey(self.lidar, **place, **{name: rows(getattr(self, name)) for name in fields})
+
+    def _lidar_at(self, position: Float[np.ndarray, "axes"], shot: int) -> Lidar:
+        """Place the lidar at a position, in the direction of a shot."""
+        angles = {name: jnp.asarray(getattr(self, name)[shot], float) for name in ("zenith", "azimuth")}
+        altitude = None if self.altitude is None else jnp.asarray(self.altitude[shot], float)
+        return dataclasses.replace(self.lidar, position=position, altitude=altitude, **angles)
+
+    def _index(self, shot: Any) -> int:
+        """Return the index of a shot from the start; negative numbers count from the end."""
+        n, i = len(self), operator.index(shot)
+        if not -n <= i < n:
+            raise IndexError(f"shot {i}: the survey has {n}; admissible are -{n} to {n - 1}")
+        return i % n
+
+    @staticmethod
+    def of(lidar: Lidar) -> "Survey":
+        """Make the survey of one shot: that of a lidar in its own place and direction."""
+        place = {"sensor" if lidar.has_sensor_position else "position": concrete_array(lidar.position)[None]}
+        zenith, azimuth = concrete_number(lidar.zenith), concrete_number(lidar.azimuth)
+        return Survey(lidar, **place, zenith=zenith, azimuth=azimuth)
+
+    @staticmethod
+    def join(surveys: Any) -> "Survey":
+        """Join surveys of one lidar, such as flight lines, into one.
+
+        **Arguments:** `surveys`: one or more `Survey`s, all placed by their sensors or all by their altitude.
+        Their lidars are equal but for place and direction, which are those of the shots.
+
+        **Returns:** a `Survey` of all shots in that order. `gps_time` and `scan_angle` are known where they
+        are for all of the surveys, and `flight_line` is theirs; where one has none, it numbers the surveys
+        from 1.
+
+        **Raises:** ValueError for no survey, and for lidars that differ; TypeError for other objects.
+
+        **Example:**
+
+        >>> import jaxlidar as jl
+        >>> lines = [jl.Survey.track(jl.Lidar(), (x, 0), (x, 20), 10.0) for x in (0, 30)]
+        >>> survey = jl.Survey.join(lines)
+        >>> len(survey), survey.flight_line.tolist()
+        (6, [1, 1, 1, 2, 2, 2])
+        """
+        surveys = list(surveys)
+        if not surveys:
+            raise ValueError("surveys is empty; admissible are one or more")
+        for survey in surveys:
+            check_kind("surveys", survey, Survey, "a sequence of Survey")
+        first = surveys[0]
+        for number, survey in enumerate(surveys):
+            if not eqx.tree_equal(_at_place_of(first.lidar, survey.lidar), first.lidar):
+                raise ValueError(f"surveys: the lidar of survey {number} is not that of the first")
+
+        def rows(name: str) -> np.ndarray | None:
+            arrays = [getattr(survey, name) for survey in surveys]
+            return None if any(a is None for a in arrays) else np.concatenate(arrays)
+
+        fields = ("zenith", "azimuth", "altitude", "gps_time", "scan_angle")
+        place = {"sensor" if first.has_sensor_position else "position": rows("position")}
+        flight_line = rows("flight_line")
+        if flight_line is None:
+            flight_line = np.repeat(np.arange(1, len(surveys) + 1), [len(survey) for survey in surveys])
+        return Survey(first.lidar, **place, **{name: rows(name) for name in fields}, flight_line=flight_line)
+
+    @property
+    def has_sensor_position(self) -> bool:
+        """True if shots are placed by their sensors, and time zero is the emission."""
+        return self.altitude is None
+
+    @property
+    def aim_position(self) -> Float[np.ndarray, "shots 2"] | None:
+        """The argument `position` that makes this survey; None where that is `sensor`."""
+        return None if self.has_sensor_position else self.position
+
+    @property
+    def sensor_position(self) -> Float[np.ndarray, "shots 3"] | None:
+        """The argument `sensor` that makes this survey; None where that is `position`."""
+        return self.position if self.has_sensor_position else None
+
+    @property
+    def middle(self) -> Lidar:
+        """`Lidar` in the middle of all positions, in the direction of the largest zenith angle."""
+        middle = 0.5 * (self.position.min(axis=0) + self.position.max(axis=0))
+        return self._lidar_at(middle, int(np.argmax(self.zenith)))
+
+    def about(self, origin: Float[np.ndarray, "2"]) -> "Survey":
+        """Make the same survey with positions relative to `origin`, (2,) x and y in m."""
+        origin = _horizontal_position("origin", origin)
+        origin = np.pad(origin, (0, self.position.shape[1] - 2))
+        return eqx.tree_at(lambda s: s.position, self, self.position - origin)
+
+    @property
+    def direction(self) -> Float[np.ndarray, "shots 3"]:
+        """Unit vectors (shots, 3) in which the beams travel."""
+        return beam_directions(self.zenith, self.azimuth)
+
+    @property
+    def slant_range(self) -> Float[np.ndarray, " shots"]:
+        """Distances (shots,) in m from the sensor to the aim point, as `Lidar.range_to_reference`."""
+        if self.altitude is None:
+            return np.full(len(self), AIM_DISTANCE)
+        return self.altitude / np.cos(np.deg2rad(self.zenith))
+
+    @property
+    def aim_point(self) -> Float[np.ndarray, "shots 3"]:
+        """Points (shots, 3) in m as `Lidar.aim_point`: on the reference plane, or 1 m ahead of the sensor."""
+        if self.has_sensor_position:
+            return self.position + AIM_DISTANCE * self.direction
+        return np.pad(self.position, ((0, 0), (0, 1)))
+
+    @property
+    def sensor(self) -> Float[np.ndarray, "shots 3"]:
+        """Positions (shots, 3) of the sensor in m."""
+        if self.has_sensor_position:
+            return self.position
+        return self.aim_point - self.slant_range[:, None] * self.direction
+
+    @property
+    def footprint_radius(self) -> Float[np.ndarray, " shots"]:
+        """Radii (shots,) in m of the beams at the aim point, as `Lidar.footprint_radius`."""
+        return self.slant_range * concrete_number(self.lidar.divergence) * 0.5e-3
+
+    @staticmethod
+    def grid(lidar: Lidar, low: Any, high: Any, spacing: Any) -> "Survey":
+        """Make a survey of a regular grid of footprints, row after row from the south-west.
+
+        **Arguments:**
+
+        - `lidar`: the `Lidar` of all shots.
+        - `low`: (x, y) of the first footprint in m.
+        - `high`: (x, y) of the opposite corner, m, not below `low`. No footprint lies beyond it.
+        - `spacing`: m between neighbours, positive, one number or (along x, along y).
+
+        **Returns:** a `Survey`; along each axis it has one footprint at `low` and as many more as fit.
+
+        **Raises:** ValueError for values outside their ranges, other shapes, and more shots than memory has
+        room for; TypeError for arguments that are not numbers.
+
+        **Example:**
+
+        >>> import jaxlidar as jl
+        >>> survey = jl.Survey.grid(jl.Lidar(), low=(0, 0), high=(20, 10), spacing=10.0)
+        >>> survey.position.tolist()
+        [[0.0, 0.0], [10.0, 0.0], [20.0, 0.0], [0.0, 10.0], [10.0, 10.0], [20.0, 10.0]]
+        """
+        first, last = _horizontal_position("low", low), _horizontal_position("high", high)
+        check_range("spacing", spacing, 0.0, low_open=True)
+        step = as_numpy(spacing, "spacing")
+        if step.shape not in ((), (2,)):
+            raise ValueError(f"spacing has shape {step.shape}; admissible is one number or (2,)")
+        if np.any(last < first):
+            raise ValueError(f"high = {last.tolist()} lies below low = {first.tolist()}")
+        step = np.broadcast_to(step, (2,))
+        counts = [_count_along(float(last[k] - first[k]), float(step[k])) for k in range(2)]
+        _check_number_of_shots(f"spacing = {step.tolist()}", counts[0] * counts[1])
+        x, y = (first[k] + step[k] * np.arange(counts[k]) for k in range(2))
+        return Survey(lidar, np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2))
+
+    @staticmethod
+    def track(
+        lidar: Lidar, start: Any, end: Any, spacing: Any, *, beams: int = 1, beam_spacing: Any = 600.0
+    ) -> "Survey":
+        """Make a survey of footprints along a line, of one beam or of several side by side as GEDI has.
+
+        **Arguments:**
+
+        - `lidar`: the `Lidar` of all shots.
+        - `start`, `end`: (x, y) in m of the first footprint and of the end of the track. With several beams,
+          the track is their middle line.
+        - `spacing`: m between footprints along the track, positive; GEDI's are 60 m.
+        - `beams`: number of beams, at least 1. Default 1; GEDI has 8.
+        - `beam_spacing`: m between beams across the track, positive. Default 600, GEDI's.
+
+        **Returns:** a `Survey`: all footprints of the leftmost beam first, then those of the next.
+
+        **Raises:** ValueError for values outside their ranges, a line without length, and more shots than
+        memory has room for; TypeError for arguments that are not numbers.
+
+        **Example:**
+
+        >>> import jaxlidar as jl
+        >>> line = {"start": (0, 0), "end": (0, 120), "spacing": 60.0}
+        >>> survey = jl.Survey.track(jl.Lidar(), **line, beams=2, beam_spacing=10.0)
+        >>> survey.position.tolist()
+        [[-5.0, 0.0], [-5.0, 60.0], [-5.0, 120.0], [5.0, 0.0], [5.0, 60.0], [5.0, 120.0]]
+        """
+        first, forward, right, length = _line(start, end)
+        check_number("spacing", spacing, 0.0, low_open=True)
+        check_number("beam_spacing", beam_spacing, 0.0, low_open=True)
+        count = check_integer("beams", beams)
+        count_along = _count_along(length, float(spacing))
+        _check_number_of_shots(f"spacing = {float(spacing):g} with beams = {count}", count_along * count)
+        along = float(spacing) * np.arange(count_along)
+        across = float(beam_spacing) * (np.arange(count) - 0.5 * (count - 1))
+        positions = first + across[:, None, None] * right + along[None, :, None] * forward
+        return Survey(lidar, positions.reshape(-1, 2))
+
+    @staticmethod
+    def scan(
+        lidar: Lidar,
+        pattern: AbstractScan,
+        start: Any,
+        end: Any,
+        speed: Any,
+        pulse_rate: Any,
+        *,
+        gps_time: Any = 0.0,
+        flight_line: Any = 1,
+    ) -> "Survey":
+        """Make a survey of the shots of a scanner on a level platform that flies along a line.
+
+        The platform flies at the lidar's altitude above the reference plane. Zenith, azimuth and scan angle
+        (across the track, positive to the right) follow from the pattern.
+
+        **Arguments:**
+
+        - `lidar`: the `Lidar` of all shots. Its own direction is not used.
+        - `pattern`: an `Oscillating`, a `RotatingPolygon`, a `Conical`, or another `AbstractScan`.
+        - `start`, `end`: (x, y) in m of the platform at the first shot and at the end of the line.
+        - `speed`: of the platform in m/s, positive.
+        - `pulse_rate`: shots per s, positive.
+        - `gps_time`: GPS time of the first shot in s, as that of `Survey`. Default 0.
+        - `flight_line`: number of the flight line. Default 1.
+
+        **Returns:** a `Survey`, its shots in the order of time.
+
+        **Raises:** ValueError for values outside their ranges, a line without length, more shots than memory
+        has room for, and a pattern that looks more than 89 degrees from the vertical; TypeError for objects
+        of the wrong type.
+
+        **Example:**
+
+        >>> import jaxlidar as jl
+        >>> line = {"start": (0, 0), "end": (0, 100), "speed": 50.0, "pulse_rate": 1000.0}
+        >>> survey = jl.Survey.scan(jl.Lidar(), jl.Conical(half_angle=20.0, frequency=40.0), **line)
+        >>> print(len(survey), survey.zenith[:2].round(3).tolist())
+        2001 [20.0, 20.0]
+        """
+        check_kind(
+            "pattern", pattern, AbstractScan, "a scan pattern, as in Conical(half_angle=20, frequency=40)"
+        )
+        check_kind("lidar", lidar, Lidar, "a Lidar, as in Survey.scan(Lidar(), ...)")
+        if lidar.altitude is None:
+            raise ValueError("lidar is placed by its sensor; admissible is an altitude, or Survey.fly")
+        first, forward, _, length = _line(start, end)
+        check_number("speed", speed, 0.0, low_open=True)
+        check_number("pulse_rate", pulse_rate, 0.0, low_open=True)
+        warn_unit("pulse_rate", pulse_rate)
+        check_number("gps_time", gps_time)
+        shots = _count_along(length, float(speed) / float(pulse_rate))
+        rate = f"pulse_rate = {float(pulse_rate):g} at speed = {float(speed):g}"
+        _check_number_of_shots(rate, shots)
+        # A level and straight flight: the last shot may lie beyond the end of the line by rounding.
+        duration = max(length / float(speed), (shots - 1) / float(pulse_rate), 1.0 / float(pulse_rate))
+        ends = np.stack([first, first + float(speed) * duration * forward])
+        position = np.pad(ends, ((0, 0), (0, 1)), constant_values=float(lidar.altitude))
+        yaw = np.rad2deg(np.arctan2(forward[0], forward[1]))
+        flight = Trajectory([0.0, duration], position, yaw=yaw)
+        time = np.arange(shots) / float(pulse_rate)
+        survey = _strip(lidar, flight.at(time), pattern, flight_line)
+        # Added last: GPS times of 3e8 s leave the times since the first shot fewer digits.
+        return eqx.tree_at(lambda s: s.gps_time, survey, float(gps_time) + time)
+
+    @staticmethod
+    def fly(
+        trajectory: Any,
+        scan: AbstractScan | None = None,
+        *,
+        lidar: Lidar | None = None,
+        pulse_rate: Any = None,
+        mounting: Any = (0.0, 0.0, 0.0),
+        lever_arm: Any = (0.0, 0.0, 0.0),
+        above: Any = None,
+    ) -> "Survey":
+        """Make a survey of the shots of a scanner on a platform that moves along a trajectory.
+
+        The place of the lidar follows from the trajectory. A lidar with an altitude must look down from above
+        the reference plane at every shot, and time zero is that of the plane; with a `sensor` it may look
+        anywhere, and time zero is the emission (see `Lidar`).
+
+        **Arguments:**
+
+        - `trajectory`: a `Trajectory`, or a sequence of them: strips, which are joined. Its times are GPS
+          times, as those of `Survey`, if they are to be those of a point cloud.
+        - `scan`: an `Oscillating`, a `RotatingPolygon`, a `Conical`, or another `AbstractScan`, in the frame
+          of the scanner. Its time is that since the start of the strip. Default None: `lidar.scan`.
+        - `lidar`: the `Lidar` of all shots. Its own place and direction are not used. Default None:
+          `Lidar()`.
+        - `pulse_rate`: shots per s, positive, from the start of each strip to its end. Default None: one shot
+          at each time of the trajectory.
+        - `mounting`: (roll, pitch, yaw) in degrees that turn the scanner into the body of the platform
+          (boresight angles). Default (0, 0, 0).
+        - `lever_arm`: (forward, right, down) in m from the trajectory's position to the sensor, in the frame
+          of the body. Default (0, 0, 0).
+        - `above`: a `Terrain`: heights of the trajectory are then above that, and not above z = 0. Default
+          None.
+
+        **Returns:** a `Survey`, its shots in the order of time within each strip, with `gps_time`, the time
+        of the trajectory, `scan_angle`, and `flight_line`, which numbers the strips from 1.
+
+        **Raises:** ValueError for values outside their ranges, no scan pattern, more shots than memory has
+        room for, more than 65535 strips, a position off the terrain, and shots that look up, or more than 89
+        degrees from the vertical, or from below the reference plane, with a lidar that has an altitude;
+        TypeError for objects of the wrong type.
+
+        **Source:** see `jaxlidar.instrument.trajectory` for the rotations.
+
+        **Example:** a wing of 10 degrees down turns a beam straight down to the left.
+
+        >>> import jaxlidar as jl
+        >>> flight = jl.Trajectory([0.0, 1.0], [(0, 0, 500), (0, 60, 500)], roll=10.0)
+        >>> survey = jl.Survey.fly(flight, jl.Conical(half_angle=1e-6, frequency=1.0), pulse_rate=1.0)
+        >>> survey.zenith.round(3).tolist(), survey.azimuth.round(1).tolist()
+        ([10.0, 10.0], [270.0, 270.0])
+        """
+        lidar = Lidar() if lidar is None else lidar
+        check_kind("lidar", lidar, Lidar, "a Lidar, as in Survey.fly(..., lidar=Lidar())")
+        scan = lidar.scan if scan is None else scan
+        if scan is None:
+            raise ValueError(
+                "scan is None, and the lidar has none; admissible is a scan pattern, or lidar.scan"
+            )
+        check_kind("scan", scan, AbstractScan, "a scan pattern, as in Conical(half_angle=20, frequency=40)")
+        strips = [trajectory] if isinstance(trajectory, Trajectory) else list(trajectory)
+        if not strips:
+            raise ValueError("trajectory is empty; admissible is a Trajectory, or one or more in a sequence")
+        for strip in strips:
+            check_kind("trajectory", strip, Trajectory, "a Trajectory, or a sequence of them")
+        if pulse_rate is not None:
+            check_number("pulse_rate", pulse_rate, 0.0, low_open=True)
+            warn_unit("pulse_rate", pulse_rate)
+        scanner_turn = rotation_matrix(*three_numbers("mounting", mounting))
+        arm = three_numbers("lever_arm", lever_arm)
+        durations = [float(strip.time[-1] - strip.time[0]) for strip in strips]
+        if pulse_rate is not None:
+            counts = [_count_along(duration, 1.0 / float(pulse_rate)) for duration in durations]
+            _check_number_of_shots(f"pulse_rate = {float(pulse_rate):g}", sum(counts))
+            strips = [
+                strip.at(np.minimum(strip.time[0] + np.arange(count) / float(pulse_rate), strip.time[-1]))
+                for strip, count in zip(strips, counts)
+            ]
+        if above is not None:
+            strips = [_lifted(strip, above) for strip in strips]
+        return Survey.join(
+            _strip(lidar, strip, scan, number, scanner_turn, arm) for number, strip in enumerate(strips, 1)
+        )
+
+
+def _lifted(flight: Trajectory, terrain: Any) -> Trajectory:
+    """Return a trajectory whose heights are above a terrain as one whose heights are above z = 0."""
+    if not callable(getattr(terrain, "height_at", None)):
+        raise TypeError(f"above is a {type(terrain).__name__}; admissible is a Terrain, or None")
+    ground = np.asarray(terrain.height_at(flight.position[:, 0], flight.position[:, 1]), float)
+    return eqx.tree_at(
+        lambda f: f.position, flight, flight.position + np.pad(ground[:, None], ((0, 0), (2, 0)))
+    )
+
+
+def _strip(
+    lidar: Lidar,
+    flight: Trajectory,
+    pattern: AbstractScan,
+    flight_line: Any,
+    scanner_turn: Float[np.ndarray, "3 3"] | None = None,
+    lever_arm: Float[np.ndarray, "3"] | None = None,
+) -> Survey:
+    """Return the survey of one strip, with one shot at each time of the trajectory.
+
+    1. Directions in the frame of the scanner, turned into that of the body, and into east, north and up.
+    2. The sensors, off the trajectory by the lever arm.
+    3. Zenith, azimuth and scan angle; where beams meet the reference plane, for a lidar with an altitude.
+    """
+    direction = np.asarray(pattern.direction(flight.time - flight.time[0]), float)
+    if scanner_turn is not None:
+        direction = direction @ scanner_turn.T
+    turn, sensor = flight.rotation, flight.position
+    direction = np.einsum("sij,sj->si", turn, direction)
+    if lever_arm is not None:
+        sensor = sensor + turn @ lever_arm
+    east, north, up = direction.T
+    sine = np.hypot(east, north)
+    zenith = np.rad2deg(np.arctan2(sine, -up))
+    azimuth = np.where(sine > 0, np.rad2deg(np.arctan2(east, north)) % 360.0, 0.0)
+    # Positive to the right of the platform's heading.
+    yaw = np.deg2rad(flight.yaw)
+    scan_angle = np.rad2deg(np.arctan2(east * np.cos(yaw) - north * np.sin(yaw), -up))
+    order = {"gps_time": flight.time, "scan_angle": scan_angle, "flight_line": flight_line}
+    if lidar.has_sensor_position:
+        return Survey(lidar, sensor=sensor, zenith=zenith, azimuth=azimuth, **order)
+    # A pattern at the limit may exceed it by rounding.
+    if not np.all(zenith <= MAX_ZENITH + 1e-9):
+        raise ValueError(
+            f"pattern looks {float(np.max(zenith)):g} degrees from the vertical; admissible is "
+            f"[0, {MAX_ZENITH:g}], or a lidar with a sensor"
+        )
+    if not np.all(sensor[:, 2] > 0):
+        raise ValueError(
+            f"position: the sensor is at z = {float(np.min(sensor[:, 2])):g} m; admissible is above the "
+            "reference plane z = 0, or a lidar with a sensor"
+        )
+    aim = sensor[:, :2] - sensor[:, 2:] * direction[:, :2] / up[:, None]
+    return Survey(lidar, aim, np.minimum(zenith, MAX_ZENITH), azimuth, sensor[:, 2], **order)
+
+
+def beam_directions(
+    zenith: Float[np.ndarray, " shots"], azimuth: Float[np.ndarray, " shots"]
+) -> Float[np.ndarray, "shots 3"]:
+    """Compute the unit vectors of beams from zenith and azimuth in degrees."""
+    zenith, azimuth = np.deg2rad(zenith), np.deg2rad(azimuth)
+    horizontal = np.sin(zenith)
+    return np.stack([horizontal * np.sin(azimuth), horizontal * np.cos(azimuth), -np.cos(zenith)], axis=-1)
+
+
+def _place(lidar: Lidar, position: Any, altitude: Any, sensor: Any) -> Float[np.ndarray, "shots axes"]:
+    """Return aim points or sensors of all shots; refuse both, and neither."""
+    if sensor is not None:
+        for field, value in (("position", position), ("altitude", altitude)):
+            if value is not None:
+                raise ValueError(f"{field} is given together with sensor; admissible is one of them")
+    elif position is None:
+        raise ValueError("neither position nor sensor is given; admissible is one of them")
+    field, value, size = ("position", position, 2) if sensor is None else ("sensor", sensor, 3)
+    check_range(field, value)
+    positions = as_numpy(value, field)
+    if positions.ndim != 2 or positions.shape[1] != size or len(positions) == 0:
+        raise ValueError(
+            f"{field} has shape {positions.shape}; admissible is (shots, {size}), one shot or more"
+        )
+    return positions
+
+
+def _at_place_of(place: Lidar, lidar: Lidar) -> Lidar:
+    """Return a lidar in the place and direction of another; as it is where these are of different kinds."""
+    if lidar.has_sensor_position != place.has_sensor_position:
+        return lidar
+    fields = ("position", "altitude", "zenith", "azimuth")
+    return dataclasses.replace(lidar, **{name: getattr(place, name) for name in fields})
+
+
+def _of_kind(lidar: Lidar, has_sensors: bool) -> Lidar:
+    """Return the lidar as one that is placed by its sensor, or by its altitude."""
+    if lidar.has_sensor_position == has_sensors:
+        return lidar
+    place: dict[str, Any] = {"position": (0.0, 0.0), "altitude": 1000.0}
+    if has_sensors:
+        place = {"position": concrete_array(lidar.sensor), "altitude": None}
+    # The angles of shots take the place of the lidar's, which may not be admissible for the other kind.
+    return dataclasses.replace(lidar, **place, zenith=0.0)
+
+
+def _per_shot(field: str, x: Any, shots: int) -> Float[np.ndarray, " shots"]:
+    """Convert one number for all shots, or one for each, to an array with one for each."""
+    check_range(field, x)
+    value = as_numpy(x, field)
+    if value.shape not in ((), (shots,)):
+        raise ValueError(
+            f"{field} has shape {value.shape}; admissible is one number or ({shots},), as position"
+        )
+    return np.broadcast_to(value, (shots,)).copy()
+
+
+def _optional_per_shot(field: str, x: Any, shots: int) -> Float[np.ndarray, " shots"] | None:
+    """Convert as `_per_shot`; None stays None."""
+    return None if x is None else _per_shot(field, x, shots)
+
+
+def _horizontal_position(field: str, x: Any) -> Float[np.ndarray, "2"]:
+    check_range(field, x)
+    value = as_numpy(x, field)
+    if value.shape != (2,):
+        raise ValueError(f"{field} has shape {value.shape}; admissible is (2,): x and y")
+    return value
+
+
+def _line(start: Any, end: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
+    """Return the start, the unit vectors forward and to the right, and the length of a line."""
+    first, last = _horizontal_position("start", start), _horizontal_position("end", end)
+    length = float(np.hypot(*(last - first)))
+    if not length > 0:
+        raise ValueError(f"end = {last.tolist()} is start; admissible is a line with a length")
+    forward = (last - first) / length
+    return first, forward, np.array([forward[1], -forward[0]]), length
+
+
+def _count_along(length: float, step: float) -> int:
+    """Count the positions that lie `step` apart on a line of a given length, including its start."""
+    # A step that underflows in the division counts as one that no memory has room for.
+    steps = min(length / step, _LARGEST_COUNT) if step > 0 else _LARGEST_COUNT
+    return math.floor(steps * (1 + _SPACING_TOLERANCE) + _SPACING_TOLERANCE) + 1
+
+
+def _check_number_of_shots(cause: str, shots: int) -> None:
+    """Refuse a survey that does not fit into memory. `cause`: the arguments that ask for so many shots."""
+    memory = machine_memory()
+    if shots * _BYTES_PER_SHOT > memory:
+        raise ValueError(
+            f"{cause} asks for {shots:.3g} shots, which take about {format_bytes(shots * _BYTES_PER_SHOT)} "
+            f"of memory; admissible are at most {memory / _BYTES_PER_SHOT:.3g} in the "
+            f"{format_bytes(memory)} of this machine"
+        )

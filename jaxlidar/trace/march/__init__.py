@@ -1,0 +1,1 @@
+"""The march of a ray through voxels, and to surfaces and meshes."""

@@ -1,0 +1,1 @@
+"""Photons: orders two and above, absorption, and light that many shots share."""

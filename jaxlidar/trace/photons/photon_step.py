@@ -1,0 +1,114 @@
+"""One step of photons, in the parts that all estimators share: fly, pass plates, collide.
+
+The response (`trace.photons.higher_orders`), absorption (`trace.photons.absorption`) and the estimator of
+the paper (`examples/paper`) follow photons in the same way, and differ in what they add to a tally on the
+way:
+
+1. `meet_surfaces` and `sample_flights` say where a flight ends (`trace.march.flight`); `fly_once` is both,
+   with independent random numbers and one end for each photon.
+2. `passed_plates` says which plates the flight has passed, and which of these transmitted the photon.
+3. `collide` samples the collision at the end (`trace.photons.collisions`).
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, PRNGKeyArray
+
+from jaxlidar._vectors import FAR, Scalar, Vec, along
+from jaxlidar.trace.device_scene import DeviceScene, not_scattered
+from jaxlidar.trace.march.flight import Flight, SurfaceEncounters, meet_surfaces, sample_flights
+from jaxlidar.trace.photons.collisions import sample_collision
+from jaxlidar.trace.photons.photons import STOPPED, TRANSMITTED, Collision, Photons
+from jaxlidar.trace.photons.random_numbers import PhotonDraws
+
+
+def start_photons(x: Vec, w: Vec, path: Scalar) -> Photons:
+    """Return photons of the weight one, without a history, that start from no surface."""
+    zero = jnp.zeros(path.shape, jnp.int32)
+    return Photons(
+        x=x,
+        w=w,
+        path=path,
+        weight=jnp.ones_like(path),
+        history=zero,
+        surface=zero - 1,
+        last_scattering=not_scattered(path),
+        alive=zero == 0,
+    )
+
+
+def fly_once(
+    scene: DeviceScene, p: Photons, key: PRNGKeyArray, max_length: Float[Array, "photons"]
+) -> tuple[PhotonDraws, SurfaceEncounters, Flight]:
+    """Sample one flight of each photon, of at most `max_length`, m, with independent random numbers.
+
+    **Returns:** the numbers, for the collision; the surfaces ahead; and the flight.
+    """
+    # Not zero, whose logarithm would be an infinite optical depth.
+    tiny = jnp.finfo(p.weight.dtype).tiny
+    shape = (PhotonDraws.dimensions(scene.n_plates, return_path=False), p.weight.size)
+    uniform = jax.random.uniform(key, shape, p.weight.dtype, tiny)
+    draws = PhotonDraws.from_numbers(list(uniform), scene.n_plates)
+    encounters = meet_surfaces(scene, p, draws.plates_ahead)
+    flights = sample_flights(scene, p, encounters, max_length, draws.flight[None])
+    return draws, encounters, jax.tree.map(lambda a: a[0], flights)
+
+
+class PlatePassage(NamedTuple):
+    """A plate in the path of flights. `plate`: its number among the surfaces.
+
+    - `is_passed`: True for flights that go on behind it, by a gap or straight through its material.
+    - `is_met`: the same, or they end on it.
+    - `is_transmitted`: True for flights that went straight through its material.
+    """
+
+    plate: int
+    is_passed: Bool[Array, "*photons"]
+    is_met: Bool[Array, "*photons"]
+    is_transmitted: Bool[Array, "*photons"]
+
+
+def passed_plates(
+    scene: DeviceScene, p: Photons, flights: Flight, encounters: SurfaceEncounters
+) -> list[PlatePassage]:
+    """Return the passage of every plate. Flights may have several ends, along their first axis.
+
+    A plate is passed if it lies nearer than the end of the flight, or the flight leaves the scene, and the
+    photon did not stop at it; it is met if it is passed, or the flight ends on it. Late flights end where
+    they can be recorded no more: plates behind that are not passed.
+    """
+
+    def to_ends(a: Array) -> Array:
+        return jnp.broadcast_to(a, flights.distance.shape)
+
+    passages = []
+    for i, (surface, outcome) in enumerate(zip(scene.surfaces, encounters.outcomes)):
+        if not surface.is_plate or outcome is None:
+            continue
+        distance = encounters.distances[i]
+        # A plate at which the photon stops is an end, not a passage.
+        is_stop = to_ends(outcome == STOPPED) & (to_ends(distance) <= flights.distance)
+        is_ahead = to_ends(p.alive & (distance < FAR))
+        is_passed = is_ahead & ((to_ends(distance) < flights.distance) | flights.escaped) & ~is_stop
+        is_met = is_passed | (flights.landed & is_stop)
+        passages.append(PlatePassage(i, is_passed, is_met, is_passed & to_ends(outcome == TRANSMITTED)))
+    return passages
+
+
+def collide(
+    scene: DeviceScene, p: Photons, flight: Flight, encounters: SurfaceEncounters, draws: PhotonDraws
+) -> tuple[Vec, Scalar, Collision]:
+    """Sample the collision at the end of a flight.
+
+    **Returns:** position, path length since the sensor, and collision; those of the start, and a collision
+    without meaning, where nothing was hit.
+    """
+    flown = jnp.where(flight.has_hit, flight.distance, 0.0)
+    x = along(p.x, p.w, flown)
+    landed = flight.landed_on(encounters)
+    collision = sample_collision(
+        scene, x, p.w, flight.cell, flight.collided, landed, draws, encounters.mesh_normal
+    )
+    return x, p.path + flown, collision

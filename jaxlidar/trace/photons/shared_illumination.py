@@ -1,0 +1,158 @@
+r"""Shared illumination: responses of nodes, or of shots, from one trace.
+
+It builds on the light that enters about nodes (`trace.photons.entry_nodes`) and on the fraction of each path
+that a shot sees (`trace.first.shot_views`).
+
+What returns is linear in what is sent. A photon that enters at a with the density p(a), ends at b and returns
+the weight W
+
+    contributes  W I_f(a) / p(a) * V_f(b)  to the footprint f,
+
+with I_f the irradiance of its beam and V_f the fraction that its receiver sees. Straight down, without a
+field of view, V_f = 1, and I_f is nearly a sum of B-splines: then the response is tallied by node, and
+footprints are summed afterwards (`trace_nodes`). Otherwise every deposit is added to the shots that see it
+(`trace_shots`).
+"""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int, PRNGKeyArray
+
+from jaxlidar._jax.products import einsum
+from jaxlidar.sensors.lidar import Lidar
+from jaxlidar.trace.device_scene import DeviceScene, aim_at
+from jaxlidar.trace.first.first_order import FirstOrder, first_order
+from jaxlidar.trace.photons.entry_nodes import EntryNodes
+from jaxlidar.trace.photons.higher_orders import trace_higher_orders
+from jaxlidar.trace.photons.histories import Histories
+from jaxlidar.trace.response import (
+    FirstOrderResponse,
+    Response,
+    apply_optics_to_first,
+    first_order_response,
+    trace_first,
+)
+
+
+def trace_nodes(scene: DeviceScene, nodes: EntryNodes, key: PRNGKeyArray) -> Response:
+    """Trace the response of one batch to light about every node; leading axis: nodes.
+
+    `scene` has parallel light, and optics. Each wavelength is a trace of its own, with one history, for which
+    optics are 1.
+
+    1. Order one from few rays about each node, in groups of equal size; sum the groups of each node.
+    2. Orders two and above from photons about the nodes, tallied by node and wavelength.
+    3. Apply optics to order one; photons had theirs applied on the way.
+    """
+    assert scene.optics is not None
+    ray_key, photon_key = jax.random.split(key)
+    n_nodes = len(nodes.position)
+
+    def trace_group(
+        x: Float[Array, "rays"], y: Float[Array, "rays"], fraction: Float[Array, ""]
+    ) -> FirstOrder:
+        return first_order(scene, (x, y), jnp.broadcast_to(fraction, x.shape))
+
+    # Rays of one node are few; groups of equal size let one program trace the rays of all nodes.
+    groups = jax.vmap(trace_group)(*nodes.ray_entries(ray_key), nodes.group_fraction)
+    first = jax.tree.map(lambda a: jax.ops.segment_sum(a, nodes.group_node, n_nodes), groups)
+    if not scene.config.follows_higher_orders:
+        response = jax.vmap(lambda f: first_order_response(scene, f, f.weights))(first)
+        return jax.vmap(lambda r: apply_optics_to_first(r, scene))(response)
+    # Order one has few histories, and keeps them until here; photons had optics applied on the way.
+    histories, optics = scene.first_histories, scene.optics
+    n_wavelengths = optics.shape[1]
+    higher = trace_higher_orders(scene, photon_key, nodes)
+
+    def by_node(a: Array) -> Array:
+        """Split entries into nodes and wavelengths, as leading axes."""
+        # Entries are the last axis but one of arrays with bins, else the last.
+        axis = a.ndim - (2 if a.ndim == 3 else 1)
+        a = a.reshape(*a.shape[:axis], n_nodes, n_wavelengths, *a.shape[axis + 1 :])
+        return jnp.moveaxis(a, (axis, axis + 1), (0, 1))
+
+    return Response(
+        first=_apply_optics(first.weights, histories, optics),
+        higher=jnp.expand_dims(by_node(higher.weights), 3),
+        first_outside=_apply_optics(first.outside[..., None], histories, optics)[..., 0],
+        higher_outside=by_node(higher.outside)[..., None],
+        arrived=by_node(higher.arrived)[..., None],
+        departed=by_node(higher.departed)[..., None],
+        escaped=by_node(higher.escaped)[..., None],
+        late=by_node(higher.late)[..., None],
+        remaining=by_node(higher.remaining)[..., None],
+    )
+
+
+def _apply_optics(
+    weights: Float[Array, "nodes *rows histories bins"],
+    histories: Histories,
+    optics: Float[Array, "channels wavelengths"],
+) -> Float[Array, "nodes wavelengths *rows 1 bins"]:
+    """Sum weights over histories with optics; wavelengths become the second axis."""
+    by_wavelength = einsum("hw,...hc->...wc", histories.monomials(optics), weights)
+    return jnp.expand_dims(jnp.moveaxis(by_wavelength, -2, 1), -2)
+
+
+def trace_shots(scene: DeviceScene, lidar: Lidar, nodes: EntryNodes, key: PRNGKeyArray) -> Response:
+    """Trace the response of one batch to light about nodes, as each shot sees it; leading axis: shots.
+
+    `scene` has `shot_views`. Order one of its `first_order_shots` is traced from rays of their own.
+
+    1. Orders two and above from photons about the nodes, tallied by shot and wavelength.
+    2. Order one of each shot, from the rays of its own beam.
+    3. The energy budget from nodes, by the coefficients of each shot's spline.
+    4. Drop the dummy shot.
+    """
+    views, optics = scene.shot_views, scene.optics
+    assert views is not None
+    assert optics is not None
+    ray_key, photon_key = jax.random.split(key)
+    higher = trace_higher_orders(scene, photon_key, nodes)
+    n_shots, n_wavelengths = views.n_shots, optics.shape[1]
+
+    # Order one is traced with the group of nodes that owns the shot, once; to other groups it adds zero.
+    def to_all_shots(a: Array) -> Array:
+        return jnp.zeros((n_shots, *a.shape[1:]), a.dtype).at[views.first_order_shots].set(a)
+
+    def by_shot(a: Array) -> Array:
+        return jnp.moveaxis(a.reshape(len(a), n_shots, n_wavelengths, *a.shape[2:]), (1, 2), (0, 1))
+
+    # The budget was tallied by node. To shots it goes by the splines' coefficients, with the grid's error,
+    # which is tolerable for what no receiver records.
+    def from_nodes(a: Array) -> Array:
+        by_node = a.reshape(*a.shape[:-1], -1, n_wavelengths)
+        return einsum("sn,...nw->sw...", views.node_coefficients, by_node)[..., None]
+
+    first = jax.tree.map(to_all_shots, trace_first_of_shots(scene, lidar, views.first_order_shots, ray_key))
+    response = Response(
+        first=first.weights,
+        higher=jnp.expand_dims(by_shot(higher.weights), 3),
+        first_outside=first.outside,
+        higher_outside=by_shot(higher.outside)[..., None],
+        arrived=from_nodes(higher.arrived),
+        departed=from_nodes(higher.departed),
+        escaped=from_nodes(higher.escaped),
+        late=from_nodes(higher.late),
+        remaining=from_nodes(higher.remaining),
+    )
+    # The last is the dummy shot.
+    return jax.tree.map(lambda a: a[:-1], response)
+
+
+def trace_first_of_shots(
+    scene: DeviceScene, lidar: Lidar, shots: Int[Array, "shots"], key: PRNGKeyArray
+) -> FirstOrderResponse:
+    """Trace order one of shots of `scene.shot_views`, one after the other, each from rays of its own beam."""
+    views = scene.shot_views
+    assert views is not None
+
+    def trace_shot(number: Array) -> FirstOrderResponse:
+        # The first order depends on the shot's own divergent rays: a narrow beam through a coarse map would
+        # show the difference.
+        shot_scene = aim_at(dataclasses.replace(scene, shot_views=None), lidar, views.position[number])
+        return trace_first(shot_scene, jax.random.fold_in(key, number))
+
+    return jax.lax.map(trace_shot, shots)
