@@ -52,19 +52,19 @@ FAULTS = {
         "trace/test_ground.py",
     ),
     "a beam to the west for one to the east": Fault(
-        "instrument/lidar.py",
+        "sensors/lidar.py",
         "jnp.stack([horizontal * jnp.sin(azimuth)",
         "jnp.stack([-horizontal * jnp.sin(azimuth)",
         "trace/test_ground.py",
     ),
     "paths in and out exchanged for the hot spot": Fault(
-        "trace/first_order.py",
+        "trace/first/first_order.py",
         "self.kappa = 1.0 if scene.config.hotspot else 2.0",
         "self.kappa = 2.0 if scene.config.hotspot else 1.0",
         "trace/test_slab_first_order.py",
     ),
     "half a bin": Fault(
-        "trace/ray_segments.py",
+        "trace/march/ray_segments.py",
         "jnp.minimum(first_number + 0.5, end_position)",
         "jnp.minimum(first_number + 1.0, end_position)",
         "trace/test_slab_first_order.py",
@@ -76,37 +76,37 @@ FAULTS = {
         "trace/test_deposits.py",
     ),
     "a missing 1/2 in the radius of a Gaussian beam": Fault(
-        "trace/footprint.py", "jnp.asarray(x / 2)", "jnp.asarray(x)", "trace/test_ground.py"
+        "trace/first/footprint.py", "jnp.asarray(x / 2)", "jnp.asarray(x)", "trace/test_ground.py"
     ),
     "one way for two in the time of a surface": Fault(
-        "trace/first_order.py",
+        "trace/first/first_order.py",
         "time = 2.0 * (excess",
         "time = 1.0 * (excess",
         "trace/test_ground.py",
     ),
     "swapped axes of voxels": Fault(
-        "trace/voxel_traversal.py",
+        "trace/march/voxel_traversal.py",
         "return (i * along_y + j) * along_z",
         "return (j * along_y + i) * along_z",
         "trace/test_ray_segments.py trace/test_invariance.py",
     ),
     "reflection and transmission weighted the wrong way round": Fault(
-        "trace/collisions.py",
+        "trace/photons/collisions.py",
         "jnp.where(through, 1.0 / (1.0 - q), 1.0 / q)",
         "jnp.where(through, 1.0 / q, 1.0 / (1.0 - q))",
         "trace/test_slab_all_orders.py",
     ),
     "optical depth drawn 1.005 too long": Fault(
-        "trace/flight.py",
+        "trace/march/flight.py",
         "scene.medium, -jnp.log(u)",
         "scene.medium, -1.005 * jnp.log(u)",
-        "test_energy.py",
+        "simulation/test_energy.py",
     ),
     "a wider pulse, 1.005": Fault(
-        "instrument/pulse.py",
+        "sensors/pulse.py",
         "_FWHM_PER_SIGMA = 2 *",
         "_FWHM_PER_SIGMA = 1.99 *",
-        "instrument/test_pulse.py",
+        "sensors/test_pulse.py",
     ),
     "air on one way only": Fault(
         "scenes/atmosphere.py",
