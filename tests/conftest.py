@@ -19,7 +19,7 @@ quick_compilation.set_flags()
 jax.config.update("jax_numpy_rank_promotion", "raise")
 
 # Called a million times by the tests of trees alone, and they raise errors of their own.
-UNHOOKED = {"jaxlidar._fields.checks"}
+UNHOOKED = {"jaxlidar._fields", "jaxlidar._fields.checks"}
 
 
 def hooked_modules():
@@ -28,6 +28,9 @@ def hooked_modules():
     for package in ("jaxlidar", "inversion"):
         folders = importlib.util.find_spec(package).submodule_search_locations
         names += [module.name for module in pkgutil.iter_modules(folders, f"{package}.")]
+        # Of a package that is not hooked as a whole, its modules; to find it by name would import jaxlidar.
+        fields = [f"{folder}/_fields" for folder in folders]
+        names += [module.name for module in pkgutil.iter_modules(fields, f"{package}._fields.")]
     return [name for name in names if name not in UNHOOKED]
 
 

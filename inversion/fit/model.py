@@ -207,7 +207,7 @@ class SimulationInputs(eqx.Module):
 
     lidar: Lidar
     scene: Scene
-    plan: Plan = eqx.field(static=True)
+    plan: Plan
     setters: tuple[Setter, ...] = eqx.field(static=True)
     tangents_per_pass: int = eqx.field(static=True)
     columns_per_voxel: int = eqx.field(static=True, default=0)

@@ -374,7 +374,7 @@ def _evaluate_in_lockstep(
         return evaluate_scene(member, values, keys, n_batches)
 
     # At first order there are no photons, and all members take equally long.
-    if inputs.plan.orders == 1:
+    if not inputs.plan.config.follows_higher_orders:
         axes = (0 if has_axis.lidar else None, 0 if has_axis.scene else None, 0, 0)
         return jax.vmap(evaluate, in_axes=axes)(lidar, scene, values, n_batches)
 

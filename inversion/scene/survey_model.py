@@ -59,7 +59,7 @@ class SurveyInputs(eqx.Module):
     lidar: Lidar
     scene: Scene
     key: PRNGKeyArray
-    plan: Plan = eqx.field(static=True)
+    plan: Plan
     setters: tuple[Setter, ...] = eqx.field(static=True)
     window_shape: tuple[int, int] | None = eqx.field(static=True)
 

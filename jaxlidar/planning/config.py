@@ -7,11 +7,28 @@ numbers; a `trace.device_scene.DeviceScene` holds the latter two with JAX arrays
 """
 
 import dataclasses
-from typing import NamedTuple, final
+from typing import Any, NamedTuple, final
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
+
+
+def as_argument(tree: Any) -> Any:
+    """Return Python's numbers in a pytree as scalars of NumPy, which compiled programs take as arguments.
+
+    Python's own numbers would be constants of these programs, and each value another program.
+    """
+
+    def convert(number: Any) -> Any:
+        if isinstance(number, int) and not isinstance(number, bool):
+            return np.int32(number)
+        return np.float64(number) if isinstance(number, float) else number
+
+    return jax.tree.map(convert, tree)
+
 
 # Fine bins over which a return at an instant is spread: the quadratic B-spline.
 KERNEL_BINS = 3
@@ -81,7 +98,7 @@ class PathLimits(eqx.Module):
     max_flight: float
     max_path: float
     reflection_probability: float
-    orders: int
+    orders: int | np.int32
 
 
 @dataclasses.dataclass(frozen=True)

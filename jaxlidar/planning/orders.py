@@ -183,8 +183,8 @@ def calls_for_more_orders(
     scene: Scene,
     optics: list[MaterialOptics],
     n_channels: int,
-    rtol: float,
-    orders: int,
+    rtol: Any,
+    orders: Any,
     histories: bool,
     xp: Any,
 ) -> Any:
@@ -196,9 +196,8 @@ def calls_for_more_orders(
     if not allows_interreflection(scene):
         return False
     possible = MAX_ORDERS if not histories else affordable_orders(scene, n_channels)
-    if orders >= possible:
-        return False
-    return (orders < 2) | (xp.maximum(scattered_again(scene, optics, xp), 1e-6) ** (orders - 1) > rtol / 10)
+    remains = xp.maximum(scattered_again(scene, optics, xp), 1e-6) ** (orders - 1) > rtol / 10
+    return (orders < possible) & ((orders < 2) | remains)
 
 
 def affordable_orders(scene: Scene, n_channels: int) -> int:

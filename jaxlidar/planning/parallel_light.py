@@ -41,7 +41,7 @@ def parallel_light_bound(survey: Survey, start_distance: float, last_return: flo
     delay = 0.5 * radius**2 / slant_range / SPEED_OF_LIGHT / sample_std
     # Terms 1 and 2, in units of h / R.
     narrowing = 1.5 if lidar.field_of_view is None else 3.5
-    return min(narrowing * extent / slant_range + delay + radius / slant_range, 1.0)
+    return float(min(narrowing * extent / slant_range + delay + radius / slant_range, 1.0))
 
 
 def beams_are_parallel(survey: Survey) -> bool:

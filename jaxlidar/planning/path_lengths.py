@@ -333,7 +333,7 @@ class PathLengths:
         count = self.shape[2] + sum(columns) + divided + len(self.scene.surfaces) + 2
         return int(count) if xp is np else count
 
-    def longest_flight(self, path: float) -> Any:
+    def longest_flight(self, path: Any) -> Any:
         """Return the length, m, up to which flights are followed.
 
         It includes all flights whose light returns within `path` m of the first return. Within a periodic
@@ -363,7 +363,7 @@ class PathLengths:
         length = max(int(MAX_VOXELS - self.shape[2]), 1) / self.xp.sum(1.0 / self.size[:2])
         return float(length) if self.xp is np else length
 
-    def max_faces(self, path: float) -> Any:
+    def max_faces(self, path: Any) -> Any:
         """Return a bound on the number of voxel faces that a flight of `longest_flight(path)` crosses."""
         if self.scene.canopy is None:
             return 0

@@ -3,8 +3,9 @@
 import dataclasses
 import math
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import Any, final
 
+import equinox as eqx
 import jax
 
 from jaxlidar._constants import SPEED_OF_LIGHT
@@ -26,7 +27,7 @@ from jaxlidar.planning.channels import (
     reflection_probability,
     scene_optics,
 )
-from jaxlidar.planning.config import PathLimits, TimeBins, TraceConfig
+from jaxlidar.planning.config import PathLimits, TimeBins, TraceConfig, as_argument
 from jaxlidar.planning.effect_table import effect_table, table_lines
 from jaxlidar.planning.effects import (
     Effect,
@@ -63,7 +64,12 @@ from jaxlidar.planning.path_lengths import (
     longest_segment,
     meshes_are_in_reach,
 )
-from jaxlidar.planning.record_times import bins_and_samples, extend_to_air_return, target_bin_width
+from jaxlidar.planning.record_times import (
+    bins_and_samples,
+    extend_to_air_return,
+    pulse_band,
+    target_bin_width,
+)
 from jaxlidar.planning.size_buckets import size_bucket
 from jaxlidar.scenes.scene import Scene, check_kinds
 from jaxlidar.scenes.surfaces import AbstractSheet
@@ -78,7 +84,8 @@ MIN_BATCHES = 8
 DEPOSITS_PER_FLIGHT = 4
 
 
-class PlanScope(NamedTuple):
+@final
+class PlanScope(eqx.Module):
     """The lidars and scenes that a plan was made for; `check_plan` compares others with it.
 
     - `from_sensor`: True if the lidar is placed by its sensor, and time zero is the emission.
@@ -93,28 +100,35 @@ class PlanScope(NamedTuple):
     - `max_memory`: the user's limit in GB, or None.
     """
 
-    from_sensor: bool
-    first_return: float
-    last_return: float
-    albedo: float
-    pulse_feature: float
-    automatic_orders: bool
-    automatic_window: bool
-    affordable_orders: int
-    flat_terrain: bool
-    empty_materials: tuple[str, ...]
-    unreached_meshes: bool
-    max_memory: float | None
+    from_sensor: bool = eqx.field(static=True)
+    first_return: float = eqx.field(converter=as_argument)
+    last_return: float = eqx.field(converter=as_argument)
+    albedo: float = eqx.field(converter=as_argument)
+    pulse_feature: float = eqx.field(converter=as_argument)
+    automatic_orders: bool = eqx.field(static=True)
+    automatic_window: bool = eqx.field(static=True)
+    affordable_orders: int = eqx.field(static=True)
+    flat_terrain: bool = eqx.field(static=True)
+    empty_materials: tuple[str, ...] = eqx.field(static=True)
+    unreached_meshes: bool = eqx.field(static=True)
+    max_memory: float | None = eqx.field(converter=as_argument)
 
 
-@jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
-class Plan:
+class _EffectTable:
+    """The rows of a plan's table. All tables are equal: no compiled program depends on one."""
+
+    rows: tuple[Effect, ...] = dataclasses.field(compare=False)
+
+
+@final
+class Plan(eqx.Module):
     """Plan of a simulation: effects, time bins, orders of scattering, and numbers of rays and photons.
 
-    Plans are made by `jaxlidar.plan`. Printed, a plan is a table of effects, followed by a line of sizes. It
-    is static: what a plan leaves out is never compiled. For JAX it is a pytree without leaves, so that it can
-    be an argument of `jax.jit` and other transformations; equal plans share a program.
+    Plans are made by `jaxlidar.plan`. Printed, a plan is a table of effects, followed by a line of sizes.
+    What a plan leaves out is never compiled. For JAX it is a pytree: its lengths, times and tolerances are
+    leaves, and its names, switches and sizes are static. So it can be an argument of `jax.jit` and of other
+    transformations, and plans that differ in lengths and times alone share a program.
 
     - `config`: the static configuration of the tracer: scatterers, switches, sizes of loops and batches.
     - `limits`: lengths that bound rays and photons, and the number of orders.
@@ -122,14 +136,18 @@ class Plan:
     - `sample_start`, `sample_interval`: time of the first sample, and the interval between samples, ns.
     - `n_samples`: number of samples.
     - `bins_per_sample`: number of fine bins per sample.
+    - `first_sample`: centre of the first sample, in fine bins from that of the first bin.
     - `n_traces`: number of traces in a response: one for each wavelength, where the trace depends on it.
+    - `degree`: longest history of the orders that are followed; `config.degree` has room for longer ones.
     - `pulse_support`: times (ns) between which the pulse's energy lies.
+    - `pulse_band`: offsets of a sample's centre from a fine bin's, in fine bins, between which the sample
+      takes from the bin: a size bucket that holds the pulse.
     - `off`: names of the effects that are switched off.
     - `rtol`: relative accuracy aimed at.
     - `likely_beyond`: estimated fraction of the light in orders beyond the last.
     - `scope`: the lidars and scenes that the plan serves.
     - `memory`: bytes that a simulation is predicted to take.
-    - `effects`: the table, an `Effect` for every row; empty where it was not asked for.
+    - `table`: the rows of `effects`.
 
     **Example:**
 
@@ -139,23 +157,35 @@ class Plan:
     31 samples of 1 ns from -15 ns, 7 fine bins of 0.5 ns
     """
 
-    config: TraceConfig
-    limits: PathLimits
-    bins: TimeBins
-    sample_start: float
-    sample_interval: float
-    n_samples: int
-    bins_per_sample: int
-    n_traces: int
-    pulse_support: tuple[float, float]
-    off: tuple[str, ...]
+    config: TraceConfig = eqx.field(static=True)
+    limits: PathLimits = eqx.field(converter=as_argument)
+    bins: TimeBins = eqx.field(converter=as_argument)
+    sample_start: float = eqx.field(converter=as_argument)
+    sample_interval: float = eqx.field(converter=as_argument)
+    first_sample: float = eqx.field(converter=as_argument)
+    n_samples: int = eqx.field(static=True)
+    bins_per_sample: int = eqx.field(static=True)
+    n_traces: int = eqx.field(static=True)
+    degree: int = eqx.field(static=True)
+    pulse_support: tuple[float, float] = eqx.field(converter=as_argument)
+    pulse_band: tuple[int, int] = eqx.field(static=True)
+    off: tuple[str, ...] = eqx.field(static=True)
     # Within a JAX transformation these decide what the plan covers.
-    rtol: float
+    rtol: float = eqx.field(converter=as_argument)
     scope: PlanScope
-    # Compiled programs depend on none of the following.
-    likely_beyond: float = dataclasses.field(compare=False)
-    memory: float = dataclasses.field(compare=False)
-    effects: tuple[Effect, ...] = dataclasses.field(compare=False)
+    likely_beyond: float = eqx.field(converter=as_argument)
+    memory: float = eqx.field(converter=as_argument)
+    table: _EffectTable = eqx.field(static=True)
+
+    def __check_init__(self):
+        static_part = (dataclasses.astuple(self.config), self.pulse_band, self.off)
+        if any(isinstance(x, float) for x in jax.tree.leaves(static_part)):
+            raise TypeError("the static part of a plan has a float: each of its values would be a program")
+
+    @property
+    def effects(self) -> tuple[Effect, ...]:
+        """The table, an `Effect` for every row; empty where it was not asked for."""
+        return self.table.rows
 
     @property
     def orders(self) -> int:
@@ -175,14 +205,7 @@ class Plan:
     @property
     def photons_traced(self) -> int:
         """Photons that a batch traces: none where only one order is followed."""
-        return self.n_photons if self.orders > 1 else 0
-
-    @property
-    def degree(self) -> int:
-        """Longest history of the orders that are followed; `config.degree` has room for longer ones."""
-        # Surfaces are the ground, if there is one, plates, and materials of meshes.
-        n_plates = len(self.config.surfaces) - self.config.has_ground - self.config.n_mesh_materials
-        return max_degree(self.orders, n_plates) if self.config.keeps_histories else 0
+        return self.n_photons if self.config.follows_higher_orders else 0
 
     @property
     def is_random(self) -> bool:
@@ -216,7 +239,7 @@ class Plan:
         )
         if not self.config.uses_quadrature and self.n_rays > 1:
             sizes += f", {self.n_rays} rays"
-        if self.orders > 1:
+        if self.config.follows_higher_orders:
             sizes += f", {self.n_photons} photons a batch, {self.orders} orders"
         if not self.config.keeps_histories:
             sizes += ", optics applied while light is traced"
@@ -488,8 +511,11 @@ def plan(
         sample_interval=samples.interval,
         n_samples=samples.count,
         bins_per_sample=samples.bins_per_sample,
+        first_sample=(samples.start - bins.start) / bins.width,
         n_traces=n_traces(keeps),
+        degree=max_degree(orders, n_plates) if keeps else 0,
         pulse_support=pulse_support,
+        pulse_band=pulse_band(pulse_support, samples.interval, samples.start, bins),
         off=off,
         rtol=rtol,
         likely_beyond=order_choice.beyond,
@@ -508,7 +534,7 @@ def plan(
             max_memory=max_memory,
         ),
         memory=memory,
-        effects=table,
+        table=_EffectTable(table),
     )
 
 

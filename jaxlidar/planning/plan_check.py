@@ -188,7 +188,7 @@ def _misfit_materials(plan: Plan, lidar: Lidar, scene: Scene, xp: Any) -> Iterat
     if scope.automatic_orders:
         albedo, n_channels = largest_albedo(optics, xp), len(config.channels)
         needs_more = calls_for_more_orders(
-            scene, optics, n_channels, plan.rtol, plan.orders, config.keeps_histories, xp
+            scene, optics, n_channels, plan.rtol, plan.limits.orders, config.keeps_histories, xp
         )
 
         def few_orders() -> str:
@@ -249,8 +249,8 @@ def _misfit_times(plan: Plan, lidar: Lidar, scene: Scene, xp: Any) -> Iterator[M
     begin, end = bins.start, plan.limits.max_path / SPEED_OF_LIGHT - bins.width
     if not scope.automatic_window:
         # What a window leaves out is the caller's choice, for scenes no larger than the plan's.
-        begin, end = min(begin, scope.first_return), max(end, scope.last_return)
-    slack = bins.width + _ROUNDING * max(abs(begin), abs(end))
+        begin, end = xp.minimum(begin, scope.first_return), xp.maximum(end, scope.last_return)
+    slack = bins.width + _ROUNDING * xp.maximum(abs(begin), abs(end))
     yield Misfit(
         (first < begin - slack) | (last > end + slack),
         lambda: (
@@ -292,7 +292,7 @@ def _misfit_pulse(plan: Plan, lidar: Lidar, scene: Scene, xp: Any) -> Iterator[M
         return
     slack = plan.bins.width + _ROUNDING * (high - low)
     yield Misfit(
-        low < planned_low - slack or high > planned_high + slack,
+        (low < planned_low - slack) | (high > planned_high + slack),
         lambda: (
             f"it is for a pulse from {planned_low:.4g} to {planned_high:.4g} ns; the lidar's lasts from "
             f"{low:.4g} to {high:.4g} ns"

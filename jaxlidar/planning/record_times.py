@@ -90,6 +90,21 @@ def bins_and_samples(
     return bins, SampleTimes(begin, interval, samples, bins_per_sample)
 
 
+def pulse_band(
+    pulse_support: tuple[float, float], interval: float, sample_start: float, bins: TimeBins
+) -> tuple[int, int]:
+    """Return the offsets of samples from fine bins, in fine bins, between which a sample takes from a bin.
+
+    `interval`, `sample_start`: of the samples, ns. Both offsets are rounded outwards to a sixteenth of
+    the width's octave, so that programs are not compiled for every pulse and window.
+    """
+    first_sample, half = (sample_start - bins.start) / bins.width, 0.5 * interval
+    low = math.floor((pulse_support[0] - half) / bins.width - first_sample) - 2
+    high = math.ceil((pulse_support[1] + half) / bins.width - first_sample) + 2
+    step = max((1 << (high - low).bit_length()) // 16, 1)
+    return low // step * step, -(-high // step) * step
+
+
 def extend_to_air_return(bins: TimeBins, lidar: Lidar, samples: SampleTimes) -> TimeBins:
     """Extend bins back to where the air's own return would begin, whether it is simulated or not."""
     _, pulse_end = lidar.pulse.support(concrete_number(lidar.jitter))

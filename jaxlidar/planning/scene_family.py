@@ -19,6 +19,7 @@ from jaxlidar.planning.effects import effects_of_family
 from jaxlidar.planning.memory import MAX_APPLIED_WAVELENGTHS, transformed_bytes
 from jaxlidar.planning.path_lengths import PathLengths
 from jaxlidar.planning.plan import Plan, plan
+from jaxlidar.planning.record_times import pulse_band
 from jaxlidar.planning.size_buckets import size_bucket
 from jaxlidar.scenes.scene import Scene, check_kinds
 from jaxlidar.sensors.lidar import Lidar
@@ -66,8 +67,15 @@ def union_plan(
         covers_fully=tuple(all(c) for c in zip(*(p.config.covers_fully for p in plans))),
     )
     pulse_support = (min(low for low, _ in supports), max(high for _, high in supports))
-    scope = united.scope._replace(pulse_feature=min(p.scope.pulse_feature for p in plans))
-    return dataclasses.replace(united, bins=bins, pulse_support=pulse_support, scope=scope)
+    scope = dataclasses.replace(united.scope, pulse_feature=min(p.scope.pulse_feature for p in plans))
+    return dataclasses.replace(
+        united,
+        bins=bins,
+        first_sample=(first.sample_start - start) / first.bins.width,
+        pulse_support=pulse_support,
+        pulse_band=pulse_band(pulse_support, first.sample_interval, first.sample_start, bins),
+        scope=scope,
+    )
 
 
 def plan_scenes(
@@ -173,7 +181,8 @@ def plan_cases(
     order = [first, *(i for i in range(len(trials)) if i != first)]
     plans = [_plan_of(*cases[i], common) for i in order]
     united = union_plan([cases[i] for i in order], plans)
-    scope = united.scope._replace(
+    scope = dataclasses.replace(
+        united.scope,
         first_return=min(p.scope.first_return for p in trials),
         last_return=max(p.scope.last_return for p in trials),
         albedo=max(p.scope.albedo for p in trials),

@@ -23,8 +23,8 @@ from jaxlidar.sensors.lidar import Lidar
 class Setup(eqx.Module):
     """A lidar and a scene without the effects that a plan leaves out, and the plan.
 
-    A setup is the input of `trace_scene` and `waveform_of`; `make_setup` makes one. The plan is static; lidar
-    and scene can be traced and differentiated.
+    A setup is the input of `trace_scene` and `waveform_of`; `make_setup` makes one. Lidar and scene can be
+    traced and differentiated.
 
     - `lidar`: a `Lidar`.
     - `scene`: a `Scene`.
@@ -45,7 +45,7 @@ class Setup(eqx.Module):
 
     lidar: Lidar
     scene: Scene
-    plan: Plan = eqx.field(static=True)
+    plan: Plan
     admissible: Float[Array, ""]
     is_covered: Bool[Array, ""]
 
@@ -106,7 +106,7 @@ def make_setup(lidar: Lidar, scene: Scene, plan: Plan) -> Setup:
         )
     # A traced value cannot raise an error. NaN in all waveforms cannot be overlooked, and costs one product.
     admissible, covered = jnp.ones(()), jnp.asarray(True)
-    if any(is_traced(x) for x in jax.tree.leaves((lidar, scene))):
+    if any(is_traced(x) for x in jax.tree.leaves((lidar, scene, plan))):
         admissible = jnp.where(inadmissible((lidar, scene)), jnp.nan, admissible)
         covered = is_covered(plan, lidar, scene)
     return Setup(*without_effects(*move_aim_to_origin(lidar, scene), plan.off), plan, admissible, covered)

@@ -216,7 +216,7 @@ def _with_longest_flights(setup: Setup) -> Setup:
     """Follow flights as far as they may go, whatever the record's window is."""
     canopy, plan = setup.scene.canopy, setup.plan
     # Neither the albedo nor the tolerance of the plan matters here: scenes share the program.
-    plan = dataclasses.replace(plan, rtol=1.0, scope=plan.scope._replace(albedo=1.0))
+    plan = dataclasses.replace(plan, rtol=1.0, scope=dataclasses.replace(plan.scope, albedo=1.0))
     setup = dataclasses.replace(setup, plan=plan)
     if canopy is None or canopy.sides == "open":
         return setup

@@ -144,7 +144,9 @@ def simulate(
     }
     goal = _make_goal(rtol, atol, n_photons, max_seconds)
     given_plan = plan
-    is_transformed = is_within_program() or any(is_traced(x) for x in jax.tree.leaves((lidar, scene, key)))
+    is_transformed = is_within_program() or any(
+        is_traced(x) for x in jax.tree.leaves((lidar, scene, plan, key))
+    )
     plan = _check_or_make_plan(lidar, scene, given_plan, goal, planning, is_transformed)
     tracer = make_batch_tracer(make_setup(lidar, scene, plan), key)
     result = _run_batches(tracer, key, goal, progress, start_time)
@@ -155,7 +157,7 @@ def simulate(
         plan = _check_or_make_plan(lidar, scene, None, goal, planning | more_orders, is_transformed)
         # Orders given as an argument count as the user's. These are still the plan's choice, so that what
         # lies beyond them is reported.
-        plan = dataclasses.replace(plan, scope=plan.scope._replace(automatic_orders=True))
+        plan = dataclasses.replace(plan, scope=dataclasses.replace(plan.scope, automatic_orders=True))
         tracer = make_batch_tracer(make_setup(lidar, scene, plan), key)
         result = _run_batches(tracer, key, goal, progress, start_time)
     wave = _make_waveform(tracer, result, goal)
@@ -213,7 +215,7 @@ def _check_or_make_plan(
             f"plan is given together with {', '.join(arguments)}; admissible is either: make the plan "
             "with them"
         )
-    elif not any(is_traced(x) for x in jax.tree.leaves((lidar, scene))):
+    elif not any(is_traced(x) for x in jax.tree.leaves((lidar, scene, plan))):
         # While JAX traces a program, even what is computed of known values is traced, unless at compile time.
         with jax.ensure_compile_time_eval():
             check_plan(plan, lidar, scene)

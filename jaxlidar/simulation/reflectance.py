@@ -405,7 +405,7 @@ def _make_plan(
         height = lengths.size[2] * lengths.shape[2]
         max_faces = max(max_faces, size_bucket(lengths.voxels_along(height / sun_cosine)))
     # Light that is not followed is in the result, whatever the albedo: brighter scenes share the program.
-    plan = dataclasses.replace(plan, scope=plan.scope._replace(albedo=1.0))
+    plan = dataclasses.replace(plan, scope=dataclasses.replace(plan.scope, albedo=1.0))
     return plan.with_limits(start_distance=float(start_distance)).with_config(
         vertical=is_vertical, max_faces=max_faces
     )

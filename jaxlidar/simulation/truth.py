@@ -87,7 +87,7 @@ def truth_of(lidar: Lidar, scene: Scene, *, plan: Plan | None = None) -> Truth:
     check_kind("plan", plan, Plan | None, "a Plan that jaxlidar.plan made, or None")
     if plan is None:
         plan = make_plan(lidar, scene, describe=False)
-    elif not any(is_traced(x) for x in jax.tree.leaves((lidar, scene))):
+    elif not any(is_traced(x) for x in jax.tree.leaves((lidar, scene, plan))):
         check_plan(plan, lidar, scene)
     return truth_of_setup(make_setup(lidar, scene, plan))
 
@@ -114,7 +114,7 @@ def first_order_setup(setup: Setup) -> Setup:
     config = plan.config
     # Labels shall be no less accurate than waveforms of many batches.
     n_rays = config.n_rays if config.n_rays == 1 else max(config.n_rays, _RAYS_AT_ONCE)
-    plan = plan.with_limits(orders=1).with_config(
+    plan = dataclasses.replace(plan.with_limits(orders=1), degree=config.first_degree).with_config(
         order_steps=1,
         keeps_histories=True,
         n_rays=n_rays,

@@ -256,7 +256,7 @@ def _make_model(
         materials=plan.config.materials,
         first_degree=plan.config.first_degree if plan.config.keeps_histories else 0,
         degree=degree,
-        one_order=plan.orders == 1,
+        one_order=not plan.config.follows_higher_orders,
         can_scatter_again=allows_interreflection(setup.scene),
     )
 

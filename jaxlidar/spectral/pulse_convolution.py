@@ -13,7 +13,6 @@ fraction becomes negative (as those of Boris and Book 1973, J. Comput. Phys. 11,
 smooth on the scale of a fine bin, the error left is of fourth order in the bin's width.
 """
 
-import math
 from typing import final
 
 import equinox as eqx
@@ -106,13 +105,9 @@ def pulse_convolution(
     """
     # Offsets between a sample's centre and a fine bin's, in fine bins, from the last bin to the first.
     bins, bins_per_sample, n_samples = plan.bins, plan.bins_per_sample, n_samples or plan.n_samples
-    # That of the first sample's centre from the first bin's.
-    first_sample = (plan.sample_start - bins.start) / bins.width
     low, high = -(bins.count - 1), (n_samples - 1) * bins_per_sample
     # A band as wide as the pulse; of one offset at least, where the record lies beside all returns.
-    half = 0.5 * plan.sample_interval
-    band_low = max(low, math.floor((plan.pulse_support[0] - half) / bins.width - first_sample) - 2)
-    band_high = min(high, math.ceil((plan.pulse_support[1] + half) / bins.width - first_sample) + 2)
+    band_low, band_high = max(low, plan.pulse_band[0]), min(high, plan.pulse_band[1])
     band_low = min(band_low, high)
     band_high = max(band_high, band_low)
     dense_size = bins.count * n_samples
@@ -122,7 +117,7 @@ def pulse_convolution(
         low, high = band_low, band_high
     # The edges of samples lie a whole number of fine bins apart; one more at each end serves the fluxes.
     edge_offset = np.arange(low - 1, high + bins_per_sample + 2) - 0.5 * bins_per_sample
-    edges = as_array((edge_offset + first_sample) * bins.width)
+    edges = as_array((edge_offset + plan.first_sample) * bins.width)
     fractions = _compiled_fractions(lidar.pulse, lidar.jitter, edges, KERNEL_VARIANCE, bins_per_sample)
     return PulseConvolution(fractions, low, bins.count, n_samples, bins_per_sample, is_dense)
 
@@ -189,8 +184,9 @@ def free_sampling_convolution(lidar: Lidar, plan: Plan, n_samples: int) -> FreeS
 
     The first sample is centred where that of the plan is, and each begins where the one before it ends.
     """
-    bins, sample_start = plan.bins, plan.sample_start
-    bin_time = as_array(bins.start + bins.width * np.arange(bins.count) - sample_start)
+    bins = plan.bins
+    # From the centre of the first sample: the times themselves may be large.
+    bin_time = as_array(bins.width * (np.arange(bins.count) - plan.first_sample))
     edges = lidar.sampling_interval * as_array(np.arange(n_samples + 1) - 0.5)
     offset = edges[None, :] - bin_time[:, None]
     before, cumulative, after = (

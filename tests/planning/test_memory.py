@@ -289,7 +289,7 @@ def layered(orders, layers=4, end=100.0, max_memory=None, **settings):
     scene = jl.Scene(canopy=jl.Canopy(voxels, leaf=LEAF, bark=0.3, hotspot=False), ground=GROUND)
     settings = {"n_photons": 256, "n_rays": 64, **settings}
     plan = jl.plan(TWO_WAVELENGTHS, scene, max_orders=orders, window=(-81.0, end), describe=False, **settings)
-    plan = dataclasses.replace(plan, scope=plan.scope._replace(max_memory=max_memory))
+    plan = dataclasses.replace(plan, scope=dataclasses.replace(plan.scope, max_memory=max_memory))
     layer_factors = {"bounds": (0.5, 2.0), "start": np.ones(layers), "apply": layers_scaled, "name": "layers"}
     bound_unknowns = bind_unknowns(
         [
@@ -351,7 +351,7 @@ def test_groups_have_about_equal_sizes():
     model = layered(4)[0]
     plan = model.inputs.plan
     for columns, room, expected in ((0, 1, 0), (7, 7, 7), (7, 6, 4), (7, 3, 3), (20, 9, 7)):
-        scope = plan.scope._replace(max_memory=room_for(model, room))
+        scope = dataclasses.replace(plan.scope, max_memory=room_for(model, room))
         limited = dataclasses.replace(plan, scope=scope)
         assert tangents_per_pass(limited, columns) == expected
 

@@ -118,7 +118,7 @@ def test_columns_are_tangents_where_scores_do_not_serve():
     assert size > 0
     # Scores may take half of the plan's memory.
     for factor, dependence in ((2.1, "extinction"), (1.9, "geometric")):
-        scope = plan.scope._replace(max_memory=1e-9 * factor * size)
+        scope = dataclasses.replace(plan.scope, max_memory=1e-9 * factor * size)
         limited = dataclasses.replace(plan, scope=scope)
         methods = choose_jacobian_methods(LIDAR, scene_with(), limited, bound)
         assert [setter.dependence for setter in methods.setters] == [dependence]
