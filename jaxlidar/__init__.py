@@ -54,7 +54,7 @@ waveforms is in the package `inversion`.
 
 ## Truth and energy
 
-`truth_of`, `Truth`, `Truths`, `energy_budget`, `EnergyBudget`.
+`truth_of`, `Truth`, `energy_budget`, `EnergyBudget`.
 
 ## The steps of a simulation
 
@@ -143,7 +143,6 @@ from jaxlidar.survey.acquisition import Acquisition
 from jaxlidar.survey.coverage import OffMapWarning, ground_position
 from jaxlidar.survey.returns import DiscreteReturns
 from jaxlidar.survey.simulate_many import simulate_many
-from jaxlidar.survey.truths import Truths
 from jaxlidar.survey.waveforms import Waveforms
 from jaxlidar.trace.response import Response, trace_scene
 
@@ -266,7 +265,6 @@ __all__ = [
     # Truth and energy.
     "truth_of",
     "Truth",
-    "Truths",
     "energy_budget",
     "EnergyBudget",
     # The steps of a simulation.

@@ -33,7 +33,6 @@ LONG_EXAMPLES = {
     "jaxlidar.survey.returns.DiscreteReturns",
     "jaxlidar.survey.coverage.OffMapWarning",
     "jaxlidar.survey.simulate_many.simulate_many",
-    "jaxlidar.survey.truths.Truths",
     "jaxlidar.survey.waveforms.Waveforms",
     "jaxlidar.survey.waveforms.Waveforms.returns",
     "jaxlidar.survey.waveforms.Waveforms.true_returns",

@@ -291,27 +291,24 @@ keep_as_netcdf(
     dimensions={"2": "end"},
 )
 
-# Quantities of a `Truth`, and of the `Truths` of many shots.
-TRUTH_QUANTITIES = {
-    "returns": ("1", "apparent reflectance of order one per sample by material, of a pulse without duration"),
-    "gap_probability": ("1", "share of the beam that meets nothing down to the end of the sample"),
-    "leaf_area_density": ("m2 m-3", "one-sided area of leaf per volume"),
-    "bark_area_density": ("m2 m-3", "half of the surface of bark per volume"),
-    "plant_area_index": ("1", "area of leaf and bark per area of ground, above the end of the sample"),
-    "top_height": ("m", "height above which plants and plates intercept 1 % of the beam"),
-    "surface_height": ("m", "mean height at which the beam meets the surface"),
-    "surface_spread": ("m", "standard deviation of the height at which the beam meets the surface"),
-}
 # Samples are a dimension of their own: they may be finer than those of the waveform that it belongs to.
 keep_as_netcdf(
     Truth,
-    "truth of a simulated lidar waveform",
+    "truth of simulated lidar waveforms",
     {
         "time": ("ns", "time of arrival relative to the two-way travel time of the reference plane"),
         "height": ("m", "height above the reference plane from which light of order one arrives"),
-        **TRUTH_QUANTITIES,
+        "returns": ("1", "apparent reflectance of order one by material, of a pulse without duration"),
+        "gap_probability": ("1", "share of the beam that meets nothing down to the end of the sample"),
+        "leaf_area_density": ("m2 m-3", "one-sided area of leaf per volume"),
+        "bark_area_density": ("m2 m-3", "half of the surface of bark per volume"),
+        "plant_area_index": ("1", "area of leaf and bark per area of ground, above the end of the sample"),
+        "top_height": ("m", "height above which plants and plates intercept 1 % of the beam"),
+        "surface_height": ("m", "mean height at which the beam meets the surface"),
+        "surface_spread": ("m", "standard deviation of the height at which the beam meets the surface"),
     },
-    dimensions={"samples": "sample", "wavelengths": "wavelength"},
+    dimensions={"shots": "shot", "samples": "sample", "wavelengths": "wavelength"},
     items={"returns": "material", "surface_height": "surface", "surface_spread": "surface"},
     coordinates={"time": "sample", "height": "sample"},
+    rows="shots",
 )
