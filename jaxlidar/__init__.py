@@ -24,7 +24,7 @@ waveforms is in the package `inversion`.
 
 ## Many scenes
 
-`simulate_scenes`, `SceneWaveforms`, `plan_scenes`.
+`simulate_scenes`, `plan_scenes`.
 
 ## Scenes
 
@@ -134,7 +134,7 @@ from jaxlidar.sensors.scan import AbstractScan, Conical, Oscillating, RotatingPo
 from jaxlidar.sensors.survey import Survey
 from jaxlidar.sensors.trajectory import Trajectory
 from jaxlidar.simulation.energy import EnergyBudget, energy_budget
-from jaxlidar.simulation.many_scenes import SceneWaveforms, simulate_scenes
+from jaxlidar.simulation.many_scenes import simulate_scenes
 from jaxlidar.simulation.one_scene import LateLightWarning, UnfollowedLightWarning, simulate
 from jaxlidar.simulation.reflectance import ReflectanceFactor, plan_reflectance, reflectance_factor
 from jaxlidar.simulation.truth import Truth, truth_of
@@ -190,7 +190,6 @@ __all__ = [
     "DiscreteReturns",
     # Many scenes.
     "simulate_scenes",
-    "SceneWaveforms",
     "plan_scenes",
     # Scenes.
     "Scene",

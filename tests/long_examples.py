@@ -23,7 +23,6 @@ LONG_EXAMPLES = {
     "jaxlidar.simulation.reflectance.plan_reflectance",
     "jaxlidar.simulation.reflectance.reflectance_factor",
     "jaxlidar.plot.returns.points",
-    "jaxlidar.simulation.many_scenes.SceneWaveforms",
     "jaxlidar.scenes.mesh_surface.MeshSurface",
     "jaxlidar.scenes.scene_parts.SceneParts",
     "jaxlidar.scenes.terrain.Terrain",

@@ -91,6 +91,8 @@ def _check_case(result: Any, case: Case) -> None:
                 f"case has a lidar of {sent.tolist()} nm, the waveform is of {received.tolist()} nm: it is "
                 "not the case that it was simulated from"
             )
+    if isinstance(result, Waveform) and result.has_scenes:
+        raise ValueError(f"a case has one scene, the waveform has {len(result)}: save it without the case")
     position = getattr(result, "position", None)
     if (case.survey is None) != (position is None):
         raise ValueError("a case with a survey belongs to Waveforms, one without to a Waveform")
@@ -269,7 +271,7 @@ keep_as_netcdf(
         "recorded": ("J", "energy that the receiver records per sample, without noise"),
         "wavelength": ("nm", "wavelength of the lidar"),
     },
-    dimensions={"samples": "time", "wavelengths": "wavelength"},
+    dimensions={"scenes": "scene", "samples": "time", "wavelengths": "wavelength"},
     items={"components": "component", "energy_budget": "fate", "energy_budget_stderr": "fate"},
     coordinates={"height": "time"},
 )
