@@ -24,7 +24,7 @@ waveforms is in the package `inversion`.
 
 ## Many scenes
 
-`simulate_scenes`, `SceneWaveforms`, `plan_scenes`.
+`simulate_scenes`, `plan_scenes`.
 
 ## Scenes
 
@@ -54,7 +54,7 @@ waveforms is in the package `inversion`.
 
 ## Truth and energy
 
-`truth_of`, `Truth`, `Truths`, `energy_budget`, `EnergyBudget`.
+`truth_of`, `Truth`, `energy_budget`, `EnergyBudget`.
 
 ## The steps of a simulation
 
@@ -134,7 +134,7 @@ from jaxlidar.sensors.scan import AbstractScan, Conical, Oscillating, RotatingPo
 from jaxlidar.sensors.survey import Survey
 from jaxlidar.sensors.trajectory import Trajectory
 from jaxlidar.simulation.energy import EnergyBudget, energy_budget
-from jaxlidar.simulation.many_scenes import SceneWaveforms, simulate_scenes
+from jaxlidar.simulation.many_scenes import simulate_scenes
 from jaxlidar.simulation.one_scene import LateLightWarning, UnfollowedLightWarning, simulate
 from jaxlidar.simulation.reflectance import ReflectanceFactor, plan_reflectance, reflectance_factor
 from jaxlidar.simulation.truth import Truth, truth_of
@@ -143,7 +143,6 @@ from jaxlidar.survey.acquisition import Acquisition
 from jaxlidar.survey.coverage import OffMapWarning, ground_position
 from jaxlidar.survey.returns import DiscreteReturns
 from jaxlidar.survey.simulate_many import simulate_many
-from jaxlidar.survey.truths import Truths
 from jaxlidar.survey.waveforms import Waveforms
 from jaxlidar.trace.response import Response, trace_scene
 
@@ -191,7 +190,6 @@ __all__ = [
     "DiscreteReturns",
     # Many scenes.
     "simulate_scenes",
-    "SceneWaveforms",
     "plan_scenes",
     # Scenes.
     "Scene",
@@ -266,7 +264,6 @@ __all__ = [
     # Truth and energy.
     "truth_of",
     "Truth",
-    "Truths",
     "energy_budget",
     "EnergyBudget",
     # The steps of a simulation.

@@ -34,12 +34,15 @@ def unfollowed_message(orders: int, fraction: float) -> str:
 
 
 def summary(wave: Any) -> str:
-    """Describe a waveform in a few lines: its samples, energy budget and accuracy."""
-    wavelengths, total = np.asarray(wave.wavelength, float), np.asarray(wave.reflectance).sum(axis=1)
+    """Describe a waveform in a few lines: its samples, energy budget and accuracy; many scenes in one."""
+    wavelengths, total = np.asarray(wave.wavelength, float), np.asarray(wave.reflectance).sum(axis=-1)
     n_columns = min(len(wavelengths), 4)
     time = np.asarray(wave.time, float)
     interval = time[1] - time[0] if time.size > 1 else 0.0
-    title = f"Waveform of {time.size} samples of {interval:.3g} ns from {time[0]:.6g} ns"
+    samples = f"{time.size} samples of {interval:.3g} ns from {time[0]:.6g} ns"
+    if wave.has_scenes:
+        return f"{len(wave)} waveforms of {samples}, at {', '.join(f'{w:g}' for w in wavelengths)} nm"
+    title = f"Waveform of {samples}"
     rows = {
         "wavelength (nm)": [f"{w:g}" for w in wavelengths[:n_columns]],
         "apparent reflectance": [f"{r:.4g}" for r in total[:n_columns]],

@@ -9,6 +9,7 @@ wrong type. NumPy and JAX would drop a mask and take booleans and times for numb
 arguments become arrays by `as_array` or `as_numpy`.
 """
 
+import operator
 import sys
 import warnings
 from collections.abc import Callable, Sequence
@@ -299,6 +300,17 @@ def check_integer(field: str, x: Any, low: int = 1, high: float = np.inf) -> int
         closing = ")" if high == np.inf else "]"
         raise ValueError(f"{field} = {x} is outside the admissible range [{low}, {high}{closing} of integers")
     return int(x)
+
+
+def check_index(name: str, index: Any, count: int) -> int:
+    """Return an index along an axis of `count` items, such as a `name`, as an int.
+
+    **Raises:** IndexError for one beyond the axis, which JAX would replace; TypeError for no whole number.
+    """
+    i = operator.index(index)
+    if not -count <= i < count:
+        raise IndexError(f"{name} {i}: there are {count}; admissible are -{count} to {count - 1}")
+    return i
 
 
 def check_choice(field: str, x: object, choices: tuple[str, ...]) -> None:

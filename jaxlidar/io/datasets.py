@@ -5,6 +5,7 @@ The annotations of a class decide what becomes of its fields:
 | field | in the Dataset |
 | --- | --- |
 | array of shape "wavelengths bins" | a variable with these dimensions, or as a `ResultLayout` renames them |
+| array of shape "*shots bins" | the same, with the dimension "shots" for results that have that axis |
 | dict of such arrays | one variable with one more dimension, the first, whose coordinate has the keys |
 | dict of arrays of any shape, "..." | a variable "FIELD.NUMBER.KEY" for each, with the attribute `item` |
 | static field | an attribute, as JSON; a tuple of texts is a coordinate |
@@ -140,6 +141,18 @@ def layout_of(name: str, path: Path) -> ResultLayout:
     return LAYOUTS[name]
 
 
+def _has_leading_axis(result: Any) -> bool:
+    """Return True for a result whose arrays have the leading axis that annotations such as "*shots" admit."""
+    for field in dataclasses.fields(result):
+        dimensions, value = _dimensions(field.type) or [""], getattr(result, field.name)
+        arrays = list(value.values()) if isinstance(value, dict) else [value]
+        # Arrays of any shape do not tell.
+        is_telling = dimensions[0].startswith("*") and "..." not in dimensions
+        if is_telling and arrays and not isinstance(value, NotKept):
+            return np.ndim(arrays[0]) == len(dimensions)
+    return False
+
+
 def _array_dimensions(annotation: Any) -> list[str] | None:
     """Dimensions of an annotated array; None where the annotation is no array."""
     shape = getattr(annotation, "dim_str", None)
@@ -179,7 +192,7 @@ def datasets_of(result: Any, group: str = "/") -> dict[str, Any]:
     except ImportError as error:
         raise ImportError("datasets need xarray: pip install 'jaxlidar[io]'") from error
     layout = LAYOUTS[type(result).__name__]
-    builder = _DatasetBuilder(layout)
+    builder = _DatasetBuilder(layout, _has_leading_axis(result))
     inner_datasets: dict[str, Any] = {}
     for field in dataclasses.fields(result):
         name, value = field.name, getattr(result, field.name)
@@ -227,8 +240,8 @@ def variables_by_item(dataset: Any, field: str) -> dict[str, str]:
 class _DatasetBuilder:
     """Variables and attributes of the Dataset of one object."""
 
-    def __init__(self, layout: ResultLayout):
-        self.layout = layout
+    def __init__(self, layout: ResultLayout, has_leading_axis: bool):
+        self.layout, self._has_leading_axis = layout, has_leading_axis
         self.variables: dict[str, Any] = {}
         self.attributes: dict[str, Any] = {"title": layout.title, KIND: layout.kind.__name__}
         self._sizes: dict[str, int] = {}
@@ -271,7 +284,10 @@ class _DatasetBuilder:
 
     def _named(self, name: str, annotated: list[str], ndim: int) -> list[str]:
         """Names of all dimensions of a variable, from those of its annotation."""
-        named = [self.layout.dimensions.get(d, d) for d in annotated if d != "..."]
+        if not self._has_leading_axis:
+            annotated = [d for d in annotated if not d.startswith("*")]
+        plain = [d.removeprefix("*") for d in annotated]
+        named = [self.layout.dimensions.get(d, d) for d in plain if d != "..."]
         if "..." in annotated:
             # Axes without a name of their own.
             at = annotated.index("...")
@@ -327,7 +343,8 @@ class _GroupReader:
 
     def _field(self, layout: ResultLayout, field: Any) -> Any:
         name, annotation = field.name, field.type
-        has_rows = layout.rows is not None and (_dimensions(annotation) or [None])[0] == layout.rows
+        rows = None if layout.rows is None else layout.dimensions.get(layout.rows, layout.rows)
+        has_rows = name in self.dataset.variables and rows in self.dataset.variables[name].dims
         if field.metadata.get("static"):
             return self._static(name, annotation)
         if (
@@ -403,7 +420,7 @@ class _GroupReader:
         if annotation.dtype is Bool:
             # netCDF has no such type: bytes stand for it.
             array = array.astype(bool)
-        if annotation.array_type is np.ndarray:
+        if has_rows or annotation.array_type is np.ndarray:
             return array
         # Double precision stays double, in whatever precision JAX computes now.
         with jax.enable_x64(True):

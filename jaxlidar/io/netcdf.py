@@ -91,6 +91,8 @@ def _check_case(result: Any, case: Case) -> None:
                 f"case has a lidar of {sent.tolist()} nm, the waveform is of {received.tolist()} nm: it is "
                 "not the case that it was simulated from"
             )
+    if isinstance(result, Waveform) and result.has_scenes:
+        raise ValueError(f"a case has one scene, the waveform has {len(result)}: save it without the case")
     position = getattr(result, "position", None)
     if (case.survey is None) != (position is None):
         raise ValueError("a case with a survey belongs to Waveforms, one without to a Waveform")
@@ -269,7 +271,7 @@ keep_as_netcdf(
         "recorded": ("J", "energy that the receiver records per sample, without noise"),
         "wavelength": ("nm", "wavelength of the lidar"),
     },
-    dimensions={"samples": "time", "wavelengths": "wavelength"},
+    dimensions={"scenes": "scene", "samples": "time", "wavelengths": "wavelength"},
     items={"components": "component", "energy_budget": "fate", "energy_budget_stderr": "fate"},
     coordinates={"height": "time"},
 )
@@ -291,27 +293,24 @@ keep_as_netcdf(
     dimensions={"2": "end"},
 )
 
-# Quantities of a `Truth`, and of the `Truths` of many shots.
-TRUTH_QUANTITIES = {
-    "returns": ("1", "apparent reflectance of order one per sample by material, of a pulse without duration"),
-    "gap_probability": ("1", "share of the beam that meets nothing down to the end of the sample"),
-    "leaf_area_density": ("m2 m-3", "one-sided area of leaf per volume"),
-    "bark_area_density": ("m2 m-3", "half of the surface of bark per volume"),
-    "plant_area_index": ("1", "area of leaf and bark per area of ground, above the end of the sample"),
-    "top_height": ("m", "height above which plants and plates intercept 1 % of the beam"),
-    "surface_height": ("m", "mean height at which the beam meets the surface"),
-    "surface_spread": ("m", "standard deviation of the height at which the beam meets the surface"),
-}
 # Samples are a dimension of their own: they may be finer than those of the waveform that it belongs to.
 keep_as_netcdf(
     Truth,
-    "truth of a simulated lidar waveform",
+    "truth of simulated lidar waveforms",
     {
         "time": ("ns", "time of arrival relative to the two-way travel time of the reference plane"),
         "height": ("m", "height above the reference plane from which light of order one arrives"),
-        **TRUTH_QUANTITIES,
+        "returns": ("1", "apparent reflectance of order one by material, of a pulse without duration"),
+        "gap_probability": ("1", "share of the beam that meets nothing down to the end of the sample"),
+        "leaf_area_density": ("m2 m-3", "one-sided area of leaf per volume"),
+        "bark_area_density": ("m2 m-3", "half of the surface of bark per volume"),
+        "plant_area_index": ("1", "area of leaf and bark per area of ground, above the end of the sample"),
+        "top_height": ("m", "height above which plants and plates intercept 1 % of the beam"),
+        "surface_height": ("m", "mean height at which the beam meets the surface"),
+        "surface_spread": ("m", "standard deviation of the height at which the beam meets the surface"),
     },
-    dimensions={"samples": "sample", "wavelengths": "wavelength"},
+    dimensions={"shots": "shot", "samples": "sample", "wavelengths": "wavelength"},
     items={"returns": "material", "surface_height": "surface", "surface_spread": "surface"},
     coordinates={"time": "sample", "height": "sample"},
+    rows="shots",
 )

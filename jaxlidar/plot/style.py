@@ -62,6 +62,8 @@ def check_waveform(wave: Any) -> None:
             "many[0]; jaxlidar.plot.waterfall draws those of many shots"
         )
     check_kind("wave", wave, Waveform, "a Waveform")
+    if wave.has_scenes:
+        raise TypeError(f"wave has {len(wave)} scenes; admissible is that of one scene, as in wave[0]")
 
 
 def wavelength_rows(wave: Waveform | Waveforms, wavelength: float | None) -> Sequence[int]:

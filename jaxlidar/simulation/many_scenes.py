@@ -6,14 +6,12 @@ run side by side on all cores.
 
 import dataclasses
 import os
-from collections.abc import Iterator
-from typing import Any, final
+from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int, PRNGKeyArray
+from jaxtyping import Array, Int, PRNGKeyArray
 
 from jaxlidar._fields.checks import check_integer, check_key, check_kind, is_traced
 from jaxlidar._jax.programs import Program
@@ -31,71 +29,6 @@ from jaxlidar.spectral.waveform import Waveform
 MAX_CHUNK = 128
 
 
-@final
-class SceneWaveforms(eqx.Module):
-    """The waveforms of many scenes, as `simulate_scenes` returns them. `waves[i]` is that of scene i.
-
-    - `waveforms`: a `Waveform` whose arrays have a leading axis of scenes; fields that have no property here
-      (`components`, `energy_budget`, `lost` ...) are in it.
-
-    **Example:**
-
-    >>> import jax, jaxlidar as jl
-    >>> import jax.numpy as jnp
-    >>> scenes = jax.vmap(lambda z: jl.Scene(ground=jl.Ground(height=z, reflectance=0.4)))(jnp.arange(3.0))
-    >>> waves = jl.simulate_scenes(jl.Lidar(), scenes, key=jax.random.key(0))
-    >>> print(waves)
-    3 waveforms of 44 samples of 1 ns from -28 ns, at 1064 nm
-    >>> print(f"{float(waves[2].reflectance.sum()):.3f}")
-    0.400
-    """
-
-    waveforms: Waveform
-
-    @property
-    def time(self) -> Float[Array, " samples"]:
-        """Centres of the samples, (samples,) ns, as those of `Waveform`; all scenes share them."""
-        return self.waveforms.time[0]
-
-    @property
-    def wavelength(self) -> Float[Array, " wavelengths"]:
-        """Wavelengths of the lidar, (wavelengths,) nm."""
-        return self.waveforms.wavelength[0]
-
-    @property
-    def reflectance(self) -> Float[Array, "scenes wavelengths samples"]:
-        """Apparent reflectance per sample, (scenes, wavelengths, samples)."""
-        return self.waveforms.reflectance
-
-    @property
-    def stderr(self) -> Float[Array, "scenes wavelengths samples"]:
-        """Standard error of `reflectance`, (scenes, wavelengths, samples); zero where nothing is random."""
-        return self.waveforms.stderr
-
-    @property
-    def lost(self) -> Float[Array, "scenes wavelengths"]:
-        """As `Waveform.lost`, (scenes, wavelengths): 1 at least where the plan covers no such scene."""
-        return self.waveforms.lost
-
-    def __len__(self) -> int:
-        return len(self.waveforms.reflectance)
-
-    def __getitem__(self, scene: int) -> Waveform:
-        return jax.tree.map(lambda a: a[scene], self.waveforms)
-
-    def __iter__(self) -> Iterator[Waveform]:
-        return (self[i] for i in range(len(self)))
-
-    def __str__(self) -> str:
-        if is_traced(self.reflectance):
-            return repr(self)
-        time = np.asarray(self.time, float)
-        interval = time[1] - time[0] if time.size > 1 else 0.0
-        wavelengths = ", ".join(f"{w:g}" for w in np.asarray(self.wavelength))
-        samples = f"{time.size} samples of {interval:.3g} ns from {time[0]:.6g} ns"
-        return f"{len(self)} waveforms of {samples}, at {wavelengths} nm"
-
-
 def simulate_scenes(
     lidar: Lidar,
     scenes: Scene,
@@ -103,7 +36,7 @@ def simulate_scenes(
     key: PRNGKeyArray,
     plan: Plan | None = None,
     chunk: int | None = None,
-) -> SceneWaveforms:
+) -> Waveform:
     """Simulate the waveforms that a lidar records of many scenes of one structure.
 
     The waveform of scene i is that of `simulate(lidar, scene_i, plan=plan, key=jax.random.fold_in(key, i))`
@@ -123,7 +56,7 @@ def simulate_scenes(
     - `chunk`: scenes that are simulated at once by each core, at least 1: more take more memory. Default
       None: as many as the plan's `max_memory` has room for, 128 at most.
 
-    **Returns:** a `SceneWaveforms`, with standard errors of each scene.
+    **Returns:** a `Waveform` with an axis of scenes, and standard errors of each.
 
     **Raises:** ValueError for arrays that are no stack and other inadmissible arguments, for a plan that does
     not cover one of the scenes, and for scenes that are traced by a JAX transformation without a plan.
@@ -138,8 +71,10 @@ def simulate_scenes(
     >>> heights, reflectances = jnp.linspace(-1.0, 1.0, 100), jnp.linspace(0.1, 0.5, 100)
     >>> scenes = jax.vmap(make_scene)(heights, reflectances)
     >>> waves = jl.simulate_scenes(jl.Lidar(), scenes, key=jax.random.key(0))
-    >>> waves.reflectance.shape[:2], f"{float(waves.reflectance[99].sum()):.2f}"
+    >>> waves.reflectance.shape[:2], f"{float(waves[99].reflectance.sum()):.2f}"
     ((100, 1), '0.50')
+    >>> print(waves)
+    100 waveforms of 44 samples of 1 ns from -28 ns, at 1064 nm
     """
     check_kinds(lidar, scenes)
     check_key(key)
@@ -162,8 +97,11 @@ def simulate_scenes(
         numbers = jnp.arange(number)
         waveform_of_scene = _scene_simulation(lidar, plan, key)
         waveforms = jax.lax.map(lambda pair: waveform_of_scene(*pair), (scenes, numbers), batch_size=size)
-        return SceneWaveforms(waveforms)
-    return SceneWaveforms(_simulate_in_chunks(lidar, scenes, plan, key, number, size, refuses))
+    else:
+        waveforms = _simulate_in_chunks(lidar, scenes, plan, key, number, size, refuses)
+    # All scenes have the lidar and the plan, and so the samples, of the first.
+    axes = {name: getattr(waveforms, name)[0] for name in ("time", "height", "wavelength")}
+    return dataclasses.replace(waveforms, **axes)
 
 
 def _affordable_chunk(plan: Plan) -> int:

@@ -1,9 +1,14 @@
 """`Truth`: reference quantities of a waveform, from the scene itself. `jaxlidar.truth` computes them."""
 
+import dataclasses
 from typing import final
 
 import equinox as eqx
+import jax
+import jax.numpy as jnp
 from jaxtyping import Array, Float
+
+from jaxlidar._fields.checks import check_index
 
 
 @final
@@ -30,6 +35,9 @@ class Truth(eqx.Module):
 
     Gaps are those of the geometry, whatever the wavelength and whatever leaves transmit.
 
+    The truth of the shots of a survey (`Waveforms.truth`) has one more axis, the first, of shots; they
+    share `time`. `truth[i]` is the truth of shot i, and that of `waves[i]`.
+
     **Example:** a plate that covers half of the beam, above sloping ground.
 
     >>> import jaxlidar as jl
@@ -44,12 +52,19 @@ class Truth(eqx.Module):
     """
 
     time: Float[Array, "samples"]
-    height: Float[Array, "samples"]
-    returns: dict[str, Float[Array, "wavelengths samples"]]
-    gap_probability: Float[Array, "samples"]
-    leaf_area_density: Float[Array, "samples"]
-    bark_area_density: Float[Array, "samples"]
-    plant_area_index: Float[Array, "samples"]
-    top_height: Float[Array, ""]
-    surface_height: dict[str, Float[Array, ""]]
-    surface_spread: dict[str, Float[Array, ""]]
+    height: Float[Array, "*shots samples"]
+    returns: dict[str, Float[Array, "*shots wavelengths samples"]]
+    gap_probability: Float[Array, "*shots samples"]
+    leaf_area_density: Float[Array, "*shots samples"]
+    bark_area_density: Float[Array, "*shots samples"]
+    plant_area_index: Float[Array, "*shots samples"]
+    top_height: Float[Array, "*shots"]
+    surface_height: dict[str, Float[Array, "*shots"]]
+    surface_spread: dict[str, Float[Array, "*shots"]]
+
+    def __getitem__(self, shot: int) -> "Truth":
+        if self.top_height.ndim == 0:
+            raise TypeError("this is the truth of one waveform: it has no axis of shots")
+        i = check_index("shot", shot, len(self.top_height))
+        rows = jax.tree.map(lambda a: jnp.asarray(a[i]), dataclasses.replace(self, time=None))
+        return dataclasses.replace(rows, time=jnp.asarray(self.time))

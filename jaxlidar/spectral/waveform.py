@@ -10,7 +10,7 @@ spread it over samples.
 
 import dataclasses
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any, final
 
 import equinox as eqx
@@ -18,7 +18,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxlidar._fields.checks import check_range, is_traced
+from jaxlidar._fields.checks import check_index, check_range, is_traced
 from jaxlidar._registry import detect_returns, save_result, true_returns, waveform_html
 from jaxlidar._summary import summary
 from jaxlidar.planning.setup import Setup
@@ -79,6 +79,10 @@ class Waveform(eqx.Module):
       lidar in m, None for one that is placed by its sensor.
     - `truth`: a `Truth`, what the beam meets in the scene; None where it was not asked for.
 
+    The waveform of many scenes, as `simulate_scenes` returns it, has arrays with one more axis, the first, of
+    scenes; they share `time`, `height` and `wavelength`, which do not have it. `len(wave)` is their number,
+    `wave[i]` the waveform of scene i. Both are refused (TypeError) for the waveform of one scene.
+
     **Example:**
 
     >>> import jax
@@ -93,23 +97,23 @@ class Waveform(eqx.Module):
 
     time: Float[Array, "samples"]
     height: Float[Array, "samples"]
-    reflectance: Float[Array, "wavelengths samples"]
-    energy: Float[Array, "wavelengths samples"]
-    stderr: Float[Array, "wavelengths samples"]
-    components: dict[str, Float[Array, "wavelengths samples"]]
-    neglected: Float[Array, "wavelengths"]
-    energy_budget: dict[str, Float[Array, "wavelengths"]]
-    energy_budget_stderr: dict[str, Float[Array, "wavelengths"]]
-    lost: Float[Array, "wavelengths"]
-    recorded: Float[Array, "wavelengths samples"]
+    reflectance: Float[Array, "*scenes wavelengths samples"]
+    energy: Float[Array, "*scenes wavelengths samples"]
+    stderr: Float[Array, "*scenes wavelengths samples"]
+    components: dict[str, Float[Array, "*scenes wavelengths samples"]]
+    neglected: Float[Array, "*scenes wavelengths"]
+    energy_budget: dict[str, Float[Array, "*scenes wavelengths"]]
+    energy_budget_stderr: dict[str, Float[Array, "*scenes wavelengths"]]
+    lost: Float[Array, "*scenes wavelengths"]
+    recorded: Float[Array, "*scenes wavelengths samples"]
     wavelength: Float[Array, "wavelengths"]
     info: dict = eqx.field(static=True)
     truth: Truth | None = None
 
     @property
-    def first_order_share(self) -> Float[Array, "wavelengths"]:
+    def first_order_share(self) -> Float[Array, "*scenes wavelengths"]:
         """Fraction of `reflectance` that was scattered once, (wavelengths,); 1 where nothing returns."""
-        first, total = (jnp.sum(a, axis=1) for a in (self.components["first"], self.reflectance))
+        first, total = (jnp.sum(a, axis=-1) for a in (self.components["first"], self.reflectance))
         return jnp.where(total > 0, first / jnp.where(total > 0, total, 1.0), 1.0)
 
     def nan_where_lost(self, share: float = 0.01) -> "Waveform":
@@ -122,10 +126,10 @@ class Waveform(eqx.Module):
         0.01.
         """
         check_range("share", share, 0.0, low_open=True)
-        total = jnp.sum(self.reflectance, axis=1) + self.lost
+        total = jnp.sum(self.reflectance, axis=-1) + self.lost
         is_covered = self.lost <= share * total
         return dataclasses.replace(
-            self, reflectance=jnp.where(is_covered[:, None], self.reflectance, jnp.nan)
+            self, reflectance=jnp.where(is_covered[..., None], self.reflectance, jnp.nan)
         )
 
     def save(self, path: str | os.PathLike[str], case: Any = None) -> None:
@@ -183,6 +187,27 @@ class Waveform(eqx.Module):
         """
         return true_returns(self, lidar, **options)
 
+    @property
+    def has_scenes(self) -> bool:
+        """True if arrays have a leading axis, of scenes."""
+        return self.reflectance.ndim > 2
+
+    def __len__(self) -> int:
+        if not self.has_scenes:
+            raise TypeError("this is the waveform of one scene: it has no axis of scenes")
+        return len(self.reflectance)
+
+    def __getitem__(self, scene: int) -> "Waveform":
+        i = check_index("scene", scene, len(self))
+        # `jax.vmap` gives these, too, an axis of scenes.
+        axes = {name: getattr(self, name) for name in ("time", "height", "wavelength")}
+        shared = {name: a for name, a in axes.items() if a.ndim == 1}
+        item = jax.tree.map(lambda a: a[i], dataclasses.replace(self, **dict.fromkeys(shared)))
+        return dataclasses.replace(item, **shared)
+
+    def __iter__(self) -> Iterator["Waveform"]:
+        return (self[i] for i in range(len(self)))
+
     def __str__(self) -> str:
         if any(is_traced(x) for x in (self.time, self.reflectance)):
             return repr(self)
@@ -190,7 +215,7 @@ class Waveform(eqx.Module):
 
     def _repr_html_(self) -> str | None:
         """Return HTML for notebooks: the summary and a small figure."""
-        if any(is_traced(x) for x in (self.time, self.reflectance)):
+        if self.has_scenes or any(is_traced(x) for x in (self.time, self.reflectance)):
             return None
         return waveform_html(self)
 

@@ -22,11 +22,11 @@ from jaxlidar.io.netcdf import datasets_with_case
 from jaxlidar.io.store import ResultStore, consolidate, dataset_of_rows
 from jaxlidar.simulation.one_scene import LateLightWarning, UnfollowedLightWarning
 from jaxlidar.spectral.apply_optics import make_waveform_model, refuse_excess
+from jaxlidar.spectral.truth_class import Truth
 from jaxlidar.survey.acquisition import Acquisition
 from jaxlidar.survey.results import ShotResults
 from jaxlidar.survey.shared_illumination import GroupContribution
 from jaxlidar.survey.strategy import AbstractStrategy, Shots
-from jaxlidar.survey.truths import Truths
 from jaxlidar.survey.waveforms import Waveforms
 
 # The group of a store that has contributions until they are summed, and its number of rows of a chunk.
@@ -154,7 +154,9 @@ def waveforms_in_memory(
     light: ShotResults = results.light.values
     refuse_excess(light.excess)
     _warn_of_missing_light(results.strategy, light.late, light.unfollowed)
-    fields = {**survey_fields, **light.waveform_fields(), "truth": results.truth.values}
+    fields = {**survey_fields, **light.waveform_fields()}
+    if results.truth.values is not None:
+        fields["truth"] = _truth(results.strategy, results.truth.values)
     return _waveforms(results.strategy, fields, _info(results.strategy, start_time) | info)
 
 
@@ -212,8 +214,8 @@ class StoredSurvey:
         dataset.attrs = {name: value for name, value in dataset.attrs.items() if name not in left_out}
         self._light.write(shots, dataset)
 
-    def _write_truth(self, shots: Shots, truths: Truths) -> None:
-        self._truth.write(shots, datasets_of(truths, "/truth")["/truth"])
+    def _write_truth(self, shots: Shots, fields: dict[str, Any]) -> None:
+        self._truth.write(shots, datasets_of(_truth(self._strategy, fields), "/truth")["/truth"])
 
     def finish(self, start_time: float, **info: Any) -> None:
         """Write what is known when all tasks are done."""
@@ -237,6 +239,12 @@ def _info(strategy: AbstractStrategy, start_time: float) -> dict[str, Any]:
         "seconds": time.perf_counter() - start_time,
         **strategy.info(),
     }
+
+
+def _truth(strategy: AbstractStrategy, fields: dict[str, Any]) -> Truth:
+    """Return the truth of shots from its other fields."""
+    time: Any = np.asarray(make_waveform_model(strategy.setup).time)
+    return Truth(time=time, **fields)
 
 
 def _waveforms(strategy: AbstractStrategy, fields: dict[str, Any], info: dict[str, Any]) -> Waveforms:

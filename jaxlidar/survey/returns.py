@@ -285,7 +285,7 @@ class DetectorInput:
 
     - `time`: (samples,) ns. - `recorded`, `energy`, `stderr`: (shots, samples), as those of `Waveforms`.
     - `components`: by material, (shots, samples) apparent reflectance. - `truth`: the same of
-      `Truths.returns`, or None.
+      `Truth.returns`, or None.
     - `surface_height`: of the truth, by surface, (shots,) m; empty without truth.
     - `axes`: of the beams. - `acquisition`: of the shots. - `constant`: radiometric constant, J m2.
     - `ground_height`: (shots,) m.
@@ -360,6 +360,8 @@ def input_of_waveforms(waves: Any, wavelength: Any) -> DetectorInput:
 def input_of_waveform(wave: Any, lidar: Any, wavelength: Any) -> DetectorInput:
     """Return the input of a `Waveform` and its lidar. **Raises:** as `Waveform.returns`."""
     check_kind("lidar", lidar, Lidar, "the Lidar of the waveform")
+    if wave.has_scenes:
+        raise ValueError(f"the waveform has {len(wave)} scenes; admissible is that of one, as in wave[0]")
     if not np.array_equal(np.asarray(lidar.wavelength), np.asarray(wave.wavelength)):
         raise ValueError(
             f"lidar has {np.asarray(lidar.wavelength).tolist()} nm, the waveform "

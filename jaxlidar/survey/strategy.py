@@ -73,7 +73,7 @@ class AbstractStrategy(abc.ABC):
 
     @abc.abstractmethod
     def results_of_task(self, number: int, result: Any) -> Any:
-        """Return what a task adds: a `ShotResults` or `Truths` of its shots alone, or a contribution."""
+        """Return what a task adds: the light or the truth of its shots alone, or a contribution."""
 
     @abc.abstractmethod
     def info(self) -> dict[str, Any]:

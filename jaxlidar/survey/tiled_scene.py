@@ -35,7 +35,7 @@ from jaxlidar.survey.collect import ShotsInMemory, SurveyResults
 from jaxlidar.survey.coverage import ground_heights, off_map
 from jaxlidar.survey.results import ShotResults
 from jaxlidar.survey.strategy import AbstractStrategy, Shots, slices_of_shots
-from jaxlidar.survey.truths import StrategyWithTruth, Truths
+from jaxlidar.survey.truths import StrategyWithTruth
 
 # Radius within which a Gaussian beam is followed, over its 1/e^2 radius; 2e-8 of its energy lies beyond. It
 # is larger than in `footprint_splines`: what lies outside the rectangle is missing altogether.
@@ -243,7 +243,7 @@ class TiledSceneStrategy(AbstractStrategy):
     def shots_of_task(self, number: int) -> Shots:
         return self.tiles[number % len(self.tiles)].shots
 
-    def results_of_task(self, number: int, result: Any) -> ShotResults | Truths:
+    def results_of_task(self, number: int, result: Any) -> Any:
         """Return the results of a tile, with zeros for the materials that its part of the scene lacks."""
         if number >= self.n_light_tasks:
             return self._truths_of_tile(result)
@@ -265,16 +265,15 @@ class TiledSceneStrategy(AbstractStrategy):
             energy_budget_stderr=energy_budget_stderr,
         )
 
-    def _truths_of_tile(self, truths: Truths) -> Truths:
-        no_height = np.full(len(truths.top_height), np.nan)
-        samples, n_wavelengths = truths.gap_probability, self.survey.lidar.wavelength.size
+    def _truths_of_tile(self, truths: dict[str, Any]) -> dict[str, Any]:
+        no_height = np.full(len(truths["top_height"]), np.nan)
+        samples, n_wavelengths = truths["gap_probability"], self.survey.lidar.wavelength.size
         nothing = np.zeros((len(samples), n_wavelengths, self.setup.plan.n_samples), samples.dtype)
-        return dataclasses.replace(
-            truths,
-            returns=_in_order_of_names(truths.returns, self.materials, nothing),
-            surface_height=_in_order_of_names(truths.surface_height, self.surfaces, no_height),
-            surface_spread=_in_order_of_names(truths.surface_spread, self.surfaces, no_height),
-        )
+        return truths | {
+            "returns": _in_order_of_names(truths["returns"], self.materials, nothing),
+            "surface_height": _in_order_of_names(truths["surface_height"], self.surfaces, no_height),
+            "surface_spread": _in_order_of_names(truths["surface_spread"], self.surfaces, no_height),
+        }
 
     def info(self) -> dict[str, Any]:
         return {
@@ -350,13 +349,11 @@ def truth_of_tile(
     number: int,
     options: TileOptions,
     key: PRNGKeyArray,
-) -> Truths:
-    """Return the truth of the shots of a tile; no random numbers are drawn."""
+) -> dict[str, Any]:
+    """Return the fields of the truth of the shots of a tile, as `truths_of_chunk` does."""
     strategy = _strategy_of_tile(survey, scene, tile, options)
     chunks = _run_in_turn(StrategyWithTruth.around(strategy).truth_tasks(key))
-    truths: Truths = jax.tree.map(
-        lambda *a: np.concatenate(a), *(chunk for _, chunk in sorted(chunks.items()))
-    )
+    truths = jax.tree.map(lambda *a: np.concatenate(a), *(chunk for _, chunk in sorted(chunks.items())))
     # The last chunk is as large as the others, and filled up.
     return jax.tree.map(lambda a: a[: len(tile.shots)], truths)
 

@@ -1,6 +1,5 @@
 """The waveforms of all shots of a survey."""
 
-import operator
 import os
 from collections.abc import Callable
 from typing import Any, final
@@ -11,7 +10,7 @@ import numpy as np
 from jaxtyping import ArrayLike, Float, Int
 
 from jaxlidar._constants import SPEED_OF_LIGHT
-from jaxlidar._fields.checks import check_numbers
+from jaxlidar._fields.checks import check_index, check_numbers
 from jaxlidar._not_kept import NotKept
 from jaxlidar._progress import TaskProgress
 from jaxlidar._registry import detect_returns, true_returns
@@ -23,6 +22,7 @@ from jaxlidar.io.las_waveforms import write_las_waveforms
 from jaxlidar.sampling.adaptive import StopReason
 from jaxlidar.sensors.lidar import Lidar
 from jaxlidar.sensors.survey import beam_directions
+from jaxlidar.spectral.truth_class import Truth
 from jaxlidar.spectral.waveform import Waveform
 from jaxlidar.survey.acquisition import Acquisition
 from jaxlidar.survey.results import OPTIONAL_ARRAYS
@@ -37,7 +37,6 @@ from jaxlidar.survey.returns import (
     true_returns_of,
     wavelength_index,
 )
-from jaxlidar.survey.truths import Truths
 
 # Least cosine of a beam axis to the vertical for which a height states a point of it.
 _LEAST_COSINE = 1e-12
@@ -63,7 +62,7 @@ class Waveforms(eqx.Module):
       none.
     - `off_map`: (shots,) fraction of the light that falls outside the voxel map.
     - `error`: (shots,) relative error, as `simulate` defines it. `photons`: (shots,) number traced.
-    - `truth`: a `Truths`, what each beam meets in the scene; None unless it was asked for.
+    - `truth`: a `Truth` with an axis of shots, what each beam meets in the scene; None unless asked for.
     - `acquisition`: an `Acquisition`, what else discrete returns need; None for files of earlier versions.
     - `info`: dict of "rtol", "orders" followed, "automatic orders" (False where
       `max_orders` was given), "altitude" of the lidar in m (None for sensors), "seconds" that it took, and
@@ -105,7 +104,7 @@ class Waveforms(eqx.Module):
     error: Float[np.ndarray, " shots"]
     photons: Int[np.ndarray, " shots"]
     info: dict[str, Any] = eqx.field(static=True)
-    truth: Truths | None = None
+    truth: Truth | None = None
     acquisition: Acquisition | None = None
 
     @property
@@ -171,9 +170,7 @@ class Waveforms(eqx.Module):
         return (self[i] for i in range(len(self)))
 
     def __getitem__(self, shot: int) -> Waveform:
-        n, i = len(self), operator.index(shot)
-        if not -n <= i < n:
-            raise IndexError(f"shot {i}: there are {n}; admissible are -{n} to {n - 1}")
+        i = check_index("shot", shot, len(self))
 
         def row(arrays: dict) -> dict:
             return {name: jnp.asarray(a[i]) for name, a in arrays.items()}
@@ -193,7 +190,7 @@ class Waveforms(eqx.Module):
             recorded=jnp.asarray(self.recorded[i]),
             wavelength=jnp.asarray(self.wavelength),
             info=self._info(i),
-            truth=None if self.truth is None else self.truth.of_shot(i, *axes),
+            truth=None if self.truth is None else self.truth[i],
         )
 
     def _info(self, i: int) -> dict[str, Any]:
@@ -407,7 +404,11 @@ class Waveforms(eqx.Module):
         **Raises:** ImportError where xarray is not installed.
         """
         datasets = datasets_of(self)
-        return datasets["/"].merge(datasets["/truth"]) if self.truth is not None else datasets["/"]
+        if self.truth is None:
+            return datasets["/"]
+        # Its samples are those of the waveforms; heights follow from their times.
+        truth = datasets["/truth"].drop_vars(["time", "height"]).rename(sample="time")
+        return datasets["/"].merge(truth)
 
     def save(self, path: str | os.PathLike[str], case: Case | None = None) -> None:
         """Write the waveforms as netCDF or Zarr, which `Waveforms.open` and `jaxlidar.open` read.

@@ -127,7 +127,7 @@ def test_effects_that_are_absent_from_one_scene_are_planned():
     plan = jl.plan_scenes(LIDAR, [empty, leafy], max_orders=1, n_rays=8)
     scenes = jax.tree.map(lambda *a: jnp.stack(a), empty, leafy)
     waves = jl.simulate_scenes(LIDAR, scenes, plan=plan, key=KEY)
-    leaf = np.asarray(waves.waveforms.components["leaf"]).sum(axis=(1, 2))
+    leaf = np.asarray(waves.components["leaf"]).sum(axis=(1, 2))
     assert leaf[0] == 0
     assert leaf[1] > 0.05
 
@@ -161,6 +161,42 @@ def test_the_result_is_differentiated():
     np.testing.assert_allclose(slopes, -2 / jl.SPEED_OF_LIGHT * np.eye(3), rtol=1e-3, atol=1e-5)
     with pytest.raises(ValueError, match="plan_scenes"):
         jax.jit(lambda h: jl.simulate_scenes(jl.Lidar(), jax.vmap(ground)(h), key=KEY).reflectance)(heights)
+
+
+def test_waveforms_of_scenes_have_one_more_axis_in_memory_and_in_files(tmp_path):
+    def ground(height, reflectance):
+        return jl.Scene(ground=jl.Ground(height=height, reflectance=reflectance))
+
+    heights, reflectances = jnp.array([-1.0, 0.0, 2.0]), jnp.array([0.1, 0.2, 0.4])
+    scenes = jax.vmap(ground)(heights, reflectances)
+    waves = jl.simulate_scenes(LIDAR, scenes, key=KEY, chunk=2)
+    assert (len(waves), waves.time.ndim, waves.height.ndim) == (3, 1, 1)
+    np.testing.assert_allclose([float(wave.reflectance.sum()) for wave in waves], reflectances, rtol=1e-3)
+    for wave, height in zip(waves, heights, strict=True):
+        assert wave.time.shape == wave.reflectance[0].shape == wave.components["ground"][0].shape
+        mean = jnp.sum(wave.reflectance[0] * wave.height) / jnp.sum(wave.reflectance)
+        assert float(mean) == pytest.approx(float(height), abs=0.01)
+    np.testing.assert_array_equal(waves[-1].energy, waves.energy[2])
+    assert waves.first_order_share.shape == (3, 1)
+    with pytest.raises(IndexError, match="scene 3: there are 3"):
+        waves[3]
+    # The same within a transformation.
+    plan = jl.plan_scenes(LIDAR, scenes)
+    last = jax.jit(lambda s: jl.simulate_scenes(LIDAR, s, plan=plan, key=KEY)[2].reflectance)(scenes)
+    np.testing.assert_allclose(last, waves[2].reflectance, rtol=1e-4, atol=1e-9)
+    for name in ("waves.nc", "waves.zarr"):
+        waves.save(tmp_path / name)
+        stored = jl.open(tmp_path / name)
+        assert jax.tree.structure(stored) == jax.tree.structure(waves)
+        jax.tree.map(np.testing.assert_array_equal, stored, waves)
+    single = waves[0]
+    for refused in (len, iter, lambda wave: wave[0]):
+        with pytest.raises(TypeError, match="no axis of scenes"):
+            refused(single)
+    with pytest.raises(ValueError, match="has 3 scenes"):
+        waves.returns(LIDAR)
+    with pytest.raises(ValueError, match="a case has one scene"):
+        waves.save(tmp_path / "case.nc", jl.io.Case(LIDAR, jl.Scene(ground=jl.Ground()), KEY))
 
 
 @pytest.mark.parametrize(

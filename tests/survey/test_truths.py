@@ -113,6 +113,25 @@ def test_damaged_files_are_refused(waveforms, tmp_path):
         jl.open(path)
 
 
+def test_truths_are_one_truth_with_an_axis_of_shots(waveforms, tmp_path):
+    truth = waveforms.truth
+    assert isinstance(truth, jl.Truth)
+    assert truth.time.shape == waveforms.time.shape
+    assert truth.height.shape == truth.gap_probability.shape == (11, waveforms.time.size)
+    assert same(truth[-2], waveforms[9].truth)
+    assert not same(truth[8], waveforms[9].truth)
+    # Heights are those of each shot: zenith angles differ.
+    np.testing.assert_allclose(truth[9].height, waveforms.height_of_shot(9), atol=1e-3)
+    assert not np.allclose(truth[9].height, waveforms.height_of_shot(8), atol=1e-3)
+    for name in ("truth.nc", "truth.zarr"):
+        jl.io.save(truth, tmp_path / name)
+        assert same(jl.open(tmp_path / name), truth)
+    with pytest.raises(IndexError, match="shot 11: there are 11"):
+        truth[11]
+    with pytest.raises(TypeError, match="no axis of shots"):
+        truth[0][0]
+
+
 def test_truth_is_none_unless_asked_for(tmp_path):
     scene = jl.Scene(ground=jl.Ground())
     waveforms = jl.simulate_many(jl.Survey(jl.Lidar(), [(0, 0), (1, 0)]), scene, key=KEY)
