@@ -36,10 +36,11 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from inversion.fit.model import check_position
 from inversion.fit.unknowns import BoundUnknown, Setter, set_values
-from jaxlidar import Lidar, Plan, Scene, Survey, make_setup, total_reflectance
+from jaxlidar import Lidar, Plan, Scene, Survey, make_setup
 from jaxlidar.extend import ONE_CORE, side_by_side
-from jaxlidar.survey.per_shot import ShotGeometry, aim_offset, setup_of_shot, shot_geometry
-from jaxlidar.trace.device_scene import aim_at, build_device_scene
+from jaxlidar.spectral.apply_optics import make_waveform_model, total_samples
+from jaxlidar.survey.per_shot import ShotGeometry, aim_shot, shot_geometry
+from jaxlidar.trace.device_scene import build_device_scene
 from jaxlidar.trace.response import trace_device_scene
 
 Values = tuple[Array, ...]
@@ -88,13 +89,11 @@ def _waveforms(
         scene = _windowed(scene, shots.window, inputs.window_shape)
     setup = make_setup(inputs.lidar, scene, inputs.plan)
     # What does not depend on the shot is computed once for the chunk, outside of the loop over its shots.
-    device_scene = build_device_scene(setup, derivatives="all")
+    device_scene, model = build_device_scene(setup, derivatives="all"), make_waveform_model(setup)
 
     def waveform(shot: ShotGeometry) -> Float[Array, "wavelengths samples"]:
-        setup_here = setup_of_shot(setup, shot)
-        scene_here = aim_at(device_scene, setup_here.lidar, aim_offset(setup, shot))
-        response = trace_device_scene(scene_here, jax.random.fold_in(inputs.key, shot.number))
-        return total_reflectance(response, setup_here)
+        aimed = aim_shot(device_scene, model, scene.atmosphere, shot, inputs.key)
+        return total_samples(trace_device_scene(aimed.scene, aimed.key), aimed.model)
 
     # One after the other: a loop keeps the temporaries of one shot, where vmap would keep those of all.
     return lax.map(waveform, shots.geometry)

@@ -166,6 +166,11 @@ class TraceConfig:
         return self.order_steps >= 2
 
     @property
+    def photons_traced(self) -> int:
+        """Photons that a batch traces: none where only one order is followed."""
+        return self.n_photons if self.follows_higher_orders else 0
+
+    @property
     def is_random(self) -> bool:
         """True if anything is drawn at random."""
         return self.follows_higher_orders or (self.random_footprint and not self.uses_quadrature)

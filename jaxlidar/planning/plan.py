@@ -205,7 +205,7 @@ class Plan(eqx.Module):
     @property
     def photons_traced(self) -> int:
         """Photons that a batch traces: none where only one order is followed."""
-        return self.n_photons if self.config.follows_higher_orders else 0
+        return self.config.photons_traced
 
     @property
     def is_random(self) -> bool:

@@ -45,6 +45,8 @@ from jaxlidar.trace.response import Response
 
 # Programs have room for at least so many wavelengths.
 MIN_WAVELENGTHS = 4
+# Size buckets of samples from one power of two to the next: surveys pay for each sample.
+SAMPLE_BUCKETS = 4
 # More wavelengths than this are a spectrum: standard errors are computed at pivot wavelengths.
 MAX_EXACT_WAVELENGTHS = 16
 
@@ -107,6 +109,33 @@ class WaveformModel(eqx.Module):
     def range_factor(self) -> Float[Array, "fine"]:
         """(R_0 / R)^2 in fine bins: energy of light from the range R, over that from the reference plane."""
         return _range_factor(self.lidar, self.bin_start, self.bin_width, self.convolution.n_bins)
+
+    def aimed(
+        self, lidar: Lidar, atmosphere: Atmosphere | None, start_distance: Float[Array, ""]
+    ) -> "WaveformModel":
+        """Return the model for a lidar of another place or direction, through an atmosphere.
+
+        `start_distance`: of the rays before the reference plane, m.
+        """
+        if atmosphere is None:
+            return dataclasses.replace(self, lidar=lidar)
+        n_bins = self.convolution.n_bins
+        fine_time = self.bin_start + self.bin_width * jnp.arange(n_bins, dtype=self.bin_width.dtype)
+        transmittance, fine_air_return = _compiled_atmosphere(
+            atmosphere, lidar, fine_time, start_distance, self.bin_width
+        )
+        air_return = air_relative_energy = None
+        if fine_air_return is not None:
+            range_factor = _range_factor(lidar, self.bin_start, self.bin_width, n_bins)
+            air_return = self.convolution(fine_air_return)
+            air_relative_energy = self.convolution(fine_air_return * range_factor[None, :])
+        return dataclasses.replace(
+            self,
+            lidar=lidar,
+            transmittance=transmittance,
+            air_return=air_return,
+            air_relative_energy=air_relative_energy,
+        )
 
     def without_air_return(self) -> "WaveformModel":
         """Return the model without what the air returns."""
@@ -185,11 +214,21 @@ def setup_optics(setup: Setup) -> Float[Array, "channels wavelengths"]:
     return channel_optics(setup.lidar, setup.scene, setup.plan.config.channels)
 
 
-def make_waveform_model(setup: Setup, *, as_band: bool = False) -> WaveformModel:
-    """Make the waveform model of a setup, with its sizes as they are; `as_band`: see `pulse_convolution`."""
+def make_waveform_model(setup: Setup) -> WaveformModel:
+    """Make the waveform model of a setup, with its sizes as they are."""
+    convolution = pulse_convolution(setup.lidar, setup.plan)
+    return _make_model(setup, convolution, setup.plan.sample_interval, setup.plan.degree)
+
+
+def make_survey_model(setup: Setup) -> WaveformModel:
+    """Make the waveform model of all shots of a survey, to be aimed at each, with room for more samples.
+
+    The pulse is applied as a band (see `pulse_convolution`).
+    """
     plan = setup.plan
-    convolution = pulse_convolution(setup.lidar, plan, as_band=as_band)
-    return _make_model(setup, convolution, plan.sample_interval, plan.degree)
+    n_samples = size_bucket(plan.n_samples, SAMPLE_BUCKETS)
+    convolution = pulse_convolution(setup.lidar, plan, n_samples, as_band=True)
+    return _make_model(setup, convolution, plan.sample_interval, plan.config.degree)
 
 
 def make_free_sampling_model(setup: Setup, n_samples: int) -> WaveformModel:
@@ -222,43 +261,29 @@ def _make_model(
 ) -> WaveformModel:
     """Make the waveform model of a setup, for samples of a convolution.
 
-    1. Where there is an atmosphere: its transmittance in fine bins, and its own return in samples.
-    2. The optics of all channels, and the degrees of histories: 0 where optics are applied by the tracer.
+    1. The optics of all channels, and the degrees of histories: 0 where optics are applied by the tracer.
+    2. Where there is an atmosphere: its transmittance in fine bins, and its own return in samples.
     """
-    lidar, plan, atmosphere = setup.lidar, setup.plan, setup.scene.atmosphere
-    bins = plan.bins
-    bin_start, bin_width = (as_array(a) for a in (bins.start, bins.width))
-    transmittance = air_return = air_relative_energy = None
-    if atmosphere is not None:
-        fine_time = as_array(bins.start + bins.width * np.arange(bins.count))
-        start_distance = as_array(plan.limits.start_distance)
-        transmittance, fine_air_return = _compiled_atmosphere(
-            atmosphere, lidar, fine_time, start_distance, bin_width
-        )
-        if fine_air_return is not None:
-            range_factor = _range_factor(lidar, bin_start, bin_width, bins.count)
-            air_return, air_relative_energy = (
-                convolution(fine_air_return),
-                convolution(fine_air_return * range_factor[None, :]),
-            )
-    return WaveformModel(
+    plan, bins = setup.plan, setup.plan.bins
+    model = WaveformModel(
         optics=setup_optics(setup),
         convolution=convolution,
         time=as_array(plan.sample_start + sample_interval * np.arange(convolution.n_samples)),
-        bin_start=bin_start,
-        bin_width=bin_width,
-        transmittance=transmittance,
-        air_return=air_return,
-        air_relative_energy=air_relative_energy,
+        bin_start=as_array(bins.start),
+        bin_width=as_array(bins.width),
+        transmittance=None,
+        air_return=None,
+        air_relative_energy=None,
         admissible=setup.admissible,
         is_covered=setup.is_covered,
-        lidar=lidar,
+        lidar=setup.lidar,
         materials=plan.config.materials,
         first_degree=plan.config.first_degree if plan.config.keeps_histories else 0,
         degree=degree,
         one_order=not plan.config.follows_higher_orders,
         can_scatter_again=allows_interreflection(setup.scene),
     )
+    return model.aimed(setup.lidar, setup.scene.atmosphere, as_array(plan.limits.start_distance))
 
 
 def _atmosphere_in_bins(

@@ -26,7 +26,9 @@ get more parts, as many as the error of each asks for.
 """
 
 import dataclasses
+import functools
 import math
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -40,22 +42,24 @@ from jaxlidar._jax.threads import ONE_CORE
 from jaxlidar._jax.workers import WorkUnit, task
 from jaxlidar.planning.plan import MIN_BATCHES
 from jaxlidar.planning.setup import Setup
+from jaxlidar.planning.size_buckets import size_bucket
 from jaxlidar.sampling.adaptive import StepRule, StoppingRule, sample_until_compiled
 from jaxlidar.sampling.errors import relative_error
 from jaxlidar.sampling.moments import RunningMoments
+from jaxlidar.scenes.atmosphere import Atmosphere
+from jaxlidar.sensors.lidar import Lidar
 from jaxlidar.sensors.survey import Survey
 from jaxlidar.spectral.apply_optics import (
     BudgetTerms,
     WaveformModel,
     budget_terms,
     component_samples,
-    make_waveform_model,
+    make_survey_model,
     relative_energy_samples,
-    setup_optics,
     total_samples,
 )
-from jaxlidar.survey.results import ShotErrors, ShotResults, make_shot_results
-from jaxlidar.survey.strategy import AbstractStrategy, Shots, first_rows, slices_of_shots
+from jaxlidar.survey.results import SAMPLED_ARRAYS, ShotErrors, ShotResults, make_shot_results
+from jaxlidar.survey.strategy import AbstractStrategy, Shots, slices_of_shots, without_padding
 from jaxlidar.trace.device_scene import DeviceScene, aim_at, build_device_scene
 from jaxlidar.trace.first.first_order import FirstOrderTally
 from jaxlidar.trace.first.footprint import RaySlice, interleaving_shifts, make_beam
@@ -122,31 +126,60 @@ class ShotGeometry(NamedTuple):
 
         return ShotGeometry(self.number, *map(convert, self[1:]))
 
+    def padded_to(self, size: int) -> "ShotGeometry":
+        """Return `size` shots: these, and copies of the last one."""
+        rows = np.minimum(np.arange(size), len(self.number) - 1)
+        return ShotGeometry(*(None if a is None else np.asarray(a)[rows] for a in self))
+
 
 def shot_geometry(survey: Survey, first: int, count: int) -> ShotGeometry:
-    """Return `count` shots from number `first` on; copies of the last one fill up what there are fewer."""
-    shots = np.minimum(np.arange(first, first + count), len(survey) - 1)
+    """Return `count` shots from number `first` on."""
+    shots = np.arange(first, first + count)
     altitude = None if survey.altitude is None else survey.altitude[shots]
     position, zenith, azimuth = (a[shots] for a in (survey.position, survey.zenith, survey.azimuth))
     return ShotGeometry(shots.astype(np.int32), position, zenith, azimuth, altitude)
 
 
-def setup_of_shot(setup: Setup, shot: ShotGeometry) -> Setup:
-    """Return the setup with the lidar aimed at one shot."""
-    # `tree_at` sets nested fields without the constructors' checks, which traced values cannot have.
+def lidar_of_shot(lidar: Lidar, shot: ShotGeometry) -> Lidar:
+    """Return the lidar aimed at one shot."""
+    # `tree_at` sets fields without the constructor's checks, which traced values cannot have.
     names = ("position", "zenith", "azimuth", *(() if shot.altitude is None else ("altitude",)))
     return eqx.tree_at(
-        lambda s: tuple(getattr(s.lidar, name) for name in names),
-        setup,
+        lambda v: tuple(getattr(v, name) for name in names),
+        lidar,
         tuple(getattr(shot, name) for name in names),
     )
 
 
-def aim_offset(setup: Setup, shot: ShotGeometry) -> Float[Array, "axes"]:
-    """Return how far the aim point of a shot lies from that of a setup's lidar, m, east, north (and up)."""
+def aim_offset(lidar: Lidar, shot: ShotGeometry) -> Float[Array, "axes"]:
+    """Return how far the aim point of a shot lies from that of a lidar, m, east, north (and up)."""
     if shot.altitude is None:
-        return setup_of_shot(setup, shot).lidar.aim_point - setup.lidar.aim_point
-    return jnp.asarray(shot.position) - setup.lidar.position
+        return lidar_of_shot(lidar, shot).aim_point - lidar.aim_point
+    return jnp.asarray(shot.position) - lidar.position
+
+
+class SurveyContext(NamedTuple):
+    """What all shots of a survey have in common.
+
+    - `scene`: the device scene, at the aim point of the survey's middle. - `model`: the waveform model, with
+      room for more samples than the `n_samples` of the survey. - `atmosphere`: None without one.
+    """
+
+    scene: DeviceScene
+    model: WaveformModel
+    atmosphere: Atmosphere | None
+    n_samples: int
+
+
+def make_survey_context(setup: Setup) -> SurveyContext:
+    """Return what all shots of a survey have in common, from the setup of its middle."""
+    scene = build_device_scene(setup, derivatives="none")
+    return SurveyContext(scene, make_survey_model(setup), setup.scene.atmosphere, setup.plan.n_samples)
+
+
+def shots_to_trace(n_shots: int) -> int:
+    """Return the number of shots that a program for a chunk of so many has room for: a size bucket."""
+    return size_bucket(n_shots, 1)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -157,6 +190,11 @@ class PerShotStrategy(AbstractStrategy):
     """
 
     resolves_edges: bool
+
+    @functools.cached_property
+    def context(self) -> SurveyContext:
+        """What all tasks have in common: the device scene of this process is built once."""
+        return make_survey_context(self.setup)
 
     @property
     def shots_per_chunk(self) -> int:
@@ -178,14 +216,14 @@ class PerShotStrategy(AbstractStrategy):
             task(
                 number,
                 trace_chunk,
-                (self.setup, self._chunk_geometry(shots), self.rtol, self.kept_names, self.resolves_edges),
+                (self.context, self._chunk_geometry(shots), self.rtol, self.kept_names, self.resolves_edges),
                 key,
             )
             for number, shots in enumerate(self.shot_slices)
         ]
 
     def _chunk_geometry(self, shots: slice) -> ShotGeometry:
-        return shot_geometry(self.survey, shots.start, self.shots_per_chunk)
+        return shot_geometry(self.survey, shots.start, shots.stop - shots.start)
 
     @property
     def n_tasks(self) -> int:
@@ -207,14 +245,14 @@ class PerShotStrategy(AbstractStrategy):
         return self.shot_slices[number]
 
     def results_of_task(self, number: int, result: Any) -> ShotResults:
-        return first_rows(result, self.shot_slices[number])
+        return result
 
     def info(self) -> dict[str, Any]:
         return {"shared": False}
 
 
 def trace_chunk(
-    setup: Setup,
+    context: SurveyContext,
     shots: ShotGeometry,
     rtol: float,
     kept_names: tuple[str, ...],
@@ -222,9 +260,20 @@ def trace_chunk(
     key: PRNGKeyArray,
 ) -> ShotResults:
     """Trace a chunk of shots."""
-    return compiled_shots(
-        setup, shots.in_precision(), key, np.asarray(rtol, jnp.result_type(float)), kept_names, resolves_edges
+    n_shots = len(shots.number)
+    results = compiled_shots(
+        context.scene,
+        context.model,
+        context.atmosphere,
+        shots.padded_to(shots_to_trace(n_shots)).in_precision(),
+        np.int32(n_shots),
+        key,
+        np.asarray(rtol, jnp.result_type(float)),
+        kept_names,
+        resolves_edges,
     )
+    fields = without_padding(results._asdict(), n_shots, context.n_samples, SAMPLED_ARRAYS)
+    return ShotResults(**fields)
 
 
 class ShotBatch(NamedTuple):
@@ -245,44 +294,42 @@ class ShotBatch(NamedTuple):
 
 
 class AimedShot(NamedTuple):
-    """One shot of a survey: its device scene, setup and waveform model, and its random key."""
+    """One shot of a survey: its device scene and waveform model, and its random key."""
 
     scene: DeviceScene
-    setup: Setup
     model: WaveformModel
     key: PRNGKeyArray
 
 
-def _aim_shot(scene: DeviceScene, setup: Setup, shot: ShotGeometry, key: PRNGKeyArray) -> AimedShot:
-    """Aim the lidar and the device scene, which are those of the survey's middle, at one shot."""
-    offset = aim_offset(setup, shot)
-    # The key follows from the shot's number: its waveform does not depend on chunks or workers.
-    setup, key = setup_of_shot(setup, shot), jax.random.fold_in(key, shot.number)
-    return AimedShot(aim_at(scene, setup.lidar, offset), setup, make_waveform_model(setup, as_band=True), key)
-
-
-def _trace_shot(
+def aim_shot(
     scene: DeviceScene,
-    setup: Setup,
+    model: WaveformModel,
+    atmosphere: Atmosphere | None,
     shot: ShotGeometry,
     key: PRNGKeyArray,
-    rtol: Array,
-    kept_names: tuple[str, ...],
-) -> ShotResults:
+) -> AimedShot:
+    """Aim the device scene and the model, which are those of the survey's middle, at one shot."""
+    lidar = lidar_of_shot(model.lidar, shot)
+    aimed_model = model.aimed(lidar, atmosphere, scene.limits.start_distance)
+    aimed_scene = aim_at(scene, lidar, aim_offset(model.lidar, shot))
+    # The key follows from the shot's number: its waveform does not depend on chunks or workers.
+    return AimedShot(aimed_scene, aimed_model, jax.random.fold_in(key, shot.number))
+
+
+def _trace_shot(aimed: AimedShot, rtol: Array, kept_names: tuple[str, ...]) -> ShotResults:
     """Trace one shot until its tolerance is met.
 
     Where nothing is random, that is one batch, whose errors are zero. Otherwise the estimate is refined, by
     more batches or by denser lattices.
     """
-    aimed = _aim_shot(scene, setup, shot, key)
-    if not setup.plan.is_random:
+    if not aimed.scene.config.is_random:
         batch = ShotBatch.of_response(trace_device_scene(aimed.scene, aimed.key), aimed.model)
         waveform, energy_budget = jax.tree.map(jnp.zeros_like, _with_errors(batch))
         errors = ShotErrors(waveform, energy_budget, jnp.zeros(()))
         return make_shot_results(
             aimed.model, *batch, errors, photons=jnp.zeros((), jnp.int32), kept_names=kept_names
         )
-    if scene.config.follows_higher_orders:
+    if aimed.scene.config.follows_higher_orders:
         return _shot_results(aimed, _add_batches(aimed, rtol), kept_names)
     return _shot_results(aimed, _densify_lattices(aimed, rtol), kept_names)
 
@@ -297,7 +344,7 @@ def _shot_results(
     waveform_stderr, energy_budget_stderr = jax.tree.map(lambda a: error_factor * a, estimate.stderr)
     errors = ShotErrors(waveform_stderr, energy_budget_stderr, error_factor * _relative_error(estimate))
     mean: ShotBatch = estimate.mean_only
-    photons = estimate.count * aimed.setup.plan.photons_traced
+    photons = estimate.count * aimed.scene.config.photons_traced
     return make_shot_results(aimed.model, *mean, errors, photons=photons, kept_names=kept_names)
 
 
@@ -313,7 +360,7 @@ def _relative_error(estimate: RunningMoments) -> Array:
 
 def _add_batches(aimed: AimedShot, rtol: Array) -> RunningMoments:
     """Trace batch after batch until the error is below the tolerance."""
-    scene, _, model, key = aimed
+    scene, model, key = aimed
 
     @eqx.filter_jit
     def trace_batch(number: Array) -> ShotBatch:
@@ -341,7 +388,7 @@ def _densify_lattices(aimed: AimedShot, rtol: Array) -> RunningMoments:
        is needed for.
     3. When the tolerance is met, apply them to the mean of the responses, component by component.
     """
-    scene, _, model, key = aimed
+    scene, model, key = aimed
     side_by_side = math.gcd(MIN_BATCHES, max(_RAYS_SIDE_BY_SIDE // scene.config.n_rays, 1))
 
     def trace_lattice(number: Array, n_parts: Array) -> tuple[tuple[Array, dict[str, Array]], Response]:
@@ -393,24 +440,26 @@ def _zeros(shapes: Any) -> Any:
     return jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), shapes)
 
 
-def _are_narrow(setup: Setup, scene: DeviceScene) -> bool:
+def _are_narrow(scene: DeviceScene, model: WaveformModel) -> bool:
     """Return True if shots are narrow, and of a scene whose lattices can be traced together."""
-    if scene.config.follows_higher_orders or not setup.plan.is_random:
+    if scene.config.follows_higher_orders or not scene.config.is_random:
         return False
-    few_wavelengths = setup.lidar.wavelength.size <= MAX_WAVELENGTHS_OF_NARROW
+    few_wavelengths = model.lidar.wavelength.size <= MAX_WAVELENGTHS_OF_NARROW
     return scene.config.n_rays <= _NARROW_RAYS and few_wavelengths and can_trace_parts(scene)
 
 
 def _trace_narrow_shots(
     scene: DeviceScene,
-    setup: Setup,
+    model: WaveformModel,
+    atmosphere: Atmosphere | None,
     shots: ShotGeometry,
+    count: Array,
     key: PRNGKeyArray,
     rtol: Array,
     kept_names: tuple[str, ...],
     resolves_edges: bool,
 ) -> ShotResults:
-    """Trace the lattices of narrow shots, again with more parts for those that are not within the tolerance.
+    """Trace the lattices of the first `count` narrow shots, again for those not within the tolerance.
 
     In each round:
 
@@ -425,12 +474,16 @@ def _trace_narrow_shots(
     most = -(-scene.config.n_rays // RAYS_OF_PART)
     first_parts = jnp.clip(jnp.ceil(LEAST_PARTS_TIMES_RTOL / rtol), 1, most).astype(jnp.int32)
 
+    is_shot = jnp.arange(n_shots) < count
+
     def is_pending(n_parts: Array, results: ShotResults) -> Array:
-        return (n_parts == 0) | ((results.error > rtol) & (n_parts < max_parts))
+        return is_shot & ((n_parts == 0) | ((results.error > rtol) & (n_parts < max_parts)))
 
     def trace_some(numbers: Array, n_parts: Array) -> ShotResults:
         shots_of_group = jax.tree.map(lambda a: a[numbers], shots)
-        return _trace_together(scene, setup, shots_of_group, n_parts, key, kept_names, error_factor)
+        return _trace_together(
+            scene, model, atmosphere, shots_of_group, n_parts, key, kept_names, error_factor
+        )
 
     def next_round(state: tuple[Array, ShotResults]) -> tuple[Array, ShotResults]:
         n_parts, results = state
@@ -460,7 +513,8 @@ def _trace_narrow_shots(
 
 def _trace_together(
     scene: DeviceScene,
-    setup: Setup,
+    model: WaveformModel,
+    atmosphere: Atmosphere | None,
     shots: ShotGeometry,
     n_parts: Int[Array, "*shots"],
     key: PRNGKeyArray,
@@ -474,22 +528,21 @@ def _trace_together(
     3. Of each shot: apply optics and pulse to the lattices, whose scatter tells the errors, and to their
        mean.
     """
-    optics = setup_optics(setup)
     # Step 1. The list ends, for each shot, at:
     ends = jnp.cumsum(n_parts * MIN_BATCHES)
     n_rows, n_lattices = len(n_parts), len(n_parts) * MIN_BATCHES
     block_size = n_lattices
 
     def shifts_of(shot: ShotGeometry) -> Array:
-        random_shift = footprint_shift(scene, _aim_shot(scene, setup, shot, key).key)
+        random_shift = footprint_shift(scene, jax.random.fold_in(key, shot.number))
         return interleaving_shifts(random_shift, MIN_BATCHES)
 
     shifts = jax.vmap(shifts_of)(shots)
-    beams = jax.vmap(lambda shot: make_beam(setup_of_shot(setup, shot).lidar))(shots)
+    beams = jax.vmap(lambda shot: make_beam(lidar_of_shot(model.lidar, shot)))(shots)
     # Coordinates are relative to the aim point of the first shot. Shots that follow one another are near it;
     # at a distance, single precision places rays to 1e-7 of that.
-    offsets = jax.vmap(lambda shot: aim_offset(setup, shot))(shots)
-    scene_of_first = aim_at(scene, setup.lidar, offsets[0])
+    offsets = jax.vmap(lambda shot: aim_offset(model.lidar, shot))(shots)
+    scene_of_first = aim_at(scene, model.lidar, offsets[0])
     aims = jnp.pad(offsets - offsets[:1], ((0, 0), (0, 3 - offsets.shape[1])))
 
     # Step 2.
@@ -518,9 +571,9 @@ def _trace_together(
 
     # Step 3.
     def results_of(shot: ShotGeometry, sums: LatticeSums) -> ShotResults:
-        aimed = _aim_shot(scene, setup, shot, key)
+        aimed = aim_shot(scene, model, atmosphere, shot, key)
         aimed = aimed._replace(model=aimed.model.for_applied_optics())
-        responses = jax.vmap(lambda s: response_of_lattice(scene, s, optics))(sums)
+        responses = jax.vmap(lambda s: response_of_lattice(scene, s, model.optics))(sums)
         values = jax.vmap(lambda response: _total_and_budget(response, aimed.model))(responses)
         moments = RunningMoments.of_batches(values, responses)
         batch = ShotBatch.of_response(moments.mean_only, aimed.model)
@@ -530,20 +583,41 @@ def _trace_together(
 
 
 def _trace_shots(
-    setup: Setup,
+    scene: DeviceScene,
+    model: WaveformModel,
+    atmosphere: Atmosphere | None,
     shots: ShotGeometry,
+    count: Array,
     key: PRNGKeyArray,
     rtol: Array,
     kept_names: tuple[str, ...],
     resolves_edges: bool,
 ) -> ShotResults:
-    """Trace shots over one device scene."""
-    scene = build_device_scene(setup, derivatives="none")
-    if _are_narrow(setup, scene):
-        return _trace_narrow_shots(scene, setup, shots, key, rtol, kept_names, resolves_edges)
+    """Trace the first `count` shots over one device scene."""
+    if _are_narrow(scene, model):
+        return _trace_narrow_shots(
+            scene, model, atmosphere, shots, count, key, rtol, kept_names, resolves_edges
+        )
+
+    def trace(shot: ShotGeometry) -> ShotResults:
+        return _trace_shot(aim_shot(scene, model, atmosphere, shot, key), rtol, kept_names)
+
+    return map_first_shots(trace, shots, count)
+
+
+def map_first_shots(function: Callable[[ShotGeometry], Any], shots: ShotGeometry, count: Array) -> Any:
+    """Apply a function to each of the first `count` shots, one after the other; other rows are zero."""
     # Not `vmap`: the loops of all shots together would run until the slowest of them has met its tolerance,
     # and their arrays would not fit into a processor's cache.
-    return jax.lax.map(lambda shot: _trace_shot(scene, setup, shot, key, rtol, kept_names), shots)
+    function = eqx.filter_jit(function)
+
+    def add(number: Array, results: Any) -> Any:
+        new = function(jax.tree.map(lambda a: a[number], shots))
+        return jax.tree.map(lambda a, b: a.at[number].set(b), results, new)
+
+    shapes = jax.eval_shape(function, jax.tree.map(lambda a: a[0], shots))
+    empty = jax.tree.map(lambda a: jnp.zeros((len(shots.number), *a.shape), a.dtype), shapes)
+    return jax.lax.fori_loop(0, count, add, empty)
 
 
 compiled_shots = Program(_trace_shots, **ONE_CORE)

@@ -27,6 +27,10 @@ OPTIONAL_ARRAYS = (
 )
 
 
+# Those with an axis of samples.
+SAMPLED_ARRAYS = OPTIONAL_ARRAYS[:5]
+
+
 class ShotResults(NamedTuple):
     """Results of one shot, or of several along axis 0. The quantities are those of `Waveforms`.
 

@@ -2,7 +2,7 @@
 
 import abc
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Collection, Mapping
 from typing import Any, TypeAlias
 
 import jax
@@ -85,6 +85,14 @@ def slices_of_shots(shots: int, size: int) -> list[slice]:
     return [slice(first, min(first + size, shots)) for first in range(0, shots, size)]
 
 
-def first_rows(results: Any, shots: slice) -> Any:
-    """Return the results of a slice of shots, without the copies that fill up the last chunk."""
-    return jax.tree.map(lambda a: a[: shots.stop - shots.start], results)
+def without_padding(
+    fields: Mapping[str, Any], n_shots: int, n_samples: int, sampled_names: Collection[str]
+) -> dict[str, Any]:
+    """Return results of shots, on the host, without what fills up the sizes of a compiled program.
+
+    **Arguments:** `fields`: arrays, or dicts of arrays, with shots along axis 0. `sampled_names`: those whose
+    last axis is samples.
+    """
+    rows = jax.tree.map(lambda a: np.asarray(a)[:n_shots], dict(fields))
+    sampled = {name: rows[name] for name in sampled_names}
+    return rows | jax.tree.map(lambda a: a[..., :n_samples], sampled)

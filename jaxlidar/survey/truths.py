@@ -5,17 +5,35 @@ from typing import Any
 
 import jax
 import numpy as np
-from jaxtyping import PRNGKeyArray
+from jaxtyping import Array, PRNGKeyArray
 
 from jaxlidar._jax.programs import Program
 from jaxlidar._jax.threads import ONE_CORE
 from jaxlidar._jax.workers import WorkUnit, task
-from jaxlidar.planning.setup import Setup
+from jaxlidar.scenes.atmosphere import Atmosphere
 from jaxlidar.simulation.truth import compute_labels, first_order_setup
-from jaxlidar.spectral.apply_optics import make_waveform_model
-from jaxlidar.survey.per_shot import ShotGeometry, aim_offset, setup_of_shot, shot_geometry
-from jaxlidar.survey.strategy import AbstractStrategy, ContributionSum, Shots, first_rows
-from jaxlidar.trace.device_scene import DeviceScene, aim_at, build_device_scene
+from jaxlidar.spectral.apply_optics import WaveformModel
+from jaxlidar.survey.per_shot import (
+    ShotGeometry,
+    SurveyContext,
+    aim_shot,
+    make_survey_context,
+    map_first_shots,
+    shot_geometry,
+    shots_to_trace,
+)
+from jaxlidar.survey.strategy import AbstractStrategy, ContributionSum, Shots, without_padding
+from jaxlidar.trace.device_scene import DeviceScene
+
+# Fields of `Truth` with an axis of samples.
+_SAMPLED_FIELDS = (
+    "height",
+    "returns",
+    "gap_probability",
+    "leaf_area_density",
+    "bark_area_density",
+    "plant_area_index",
+)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -41,10 +59,14 @@ class StrategyWithTruth(AbstractStrategy):
 
     def truth_tasks(self, key: PRNGKeyArray) -> list[WorkUnit]:
         """Return the tasks for the truth alone. They draw no random numbers: `key` is passed on unused."""
-        # All are as large as the first, for one program; the last one is filled up.
-        size = self.shot_slices[0].stop
+        context = make_survey_context(first_order_setup(self.setup))
         return [
-            task(number, truths_of_chunk, (self.setup, shot_geometry(self.survey, shots.start, size)), key)
+            task(
+                number,
+                truths_of_chunk,
+                (context, shot_geometry(self.survey, shots.start, shots.stop - shots.start)),
+                key,
+            )
             for number, shots in enumerate(self.shot_slices, self.light_strategy.n_tasks)
         ]
 
@@ -72,33 +94,43 @@ class StrategyWithTruth(AbstractStrategy):
         n_light = self.n_light_tasks
         if number < n_light:
             return self.light_strategy.results_of_task(number, result)
-        return first_rows(result, self.shot_slices[number - n_light])
+        return result
 
     def info(self) -> dict[str, Any]:
         return self.light_strategy.info()
 
 
-def truths_of_chunk(setup: Setup, shots: ShotGeometry, key: PRNGKeyArray) -> dict[str, Any]:
+def truths_of_chunk(context: SurveyContext, shots: ShotGeometry, key: PRNGKeyArray) -> dict[str, Any]:
     """Return the fields of the `Truth` of a chunk of shots but `time`; no random numbers are drawn."""
     # The truth is that of the first order with a fixed key: `key` is unused, as every task has one.
-    fields = _compiled_truths(first_order_setup(setup), shots.in_precision())
-    return jax.tree.map(np.asarray, fields)
+    n_shots = len(shots.number)
+    fields = _compiled_truths(
+        context.scene,
+        context.model,
+        context.atmosphere,
+        shots.padded_to(shots_to_trace(n_shots)).in_precision(),
+        np.int32(n_shots),
+    )
+    return without_padding(fields, n_shots, context.n_samples, _SAMPLED_FIELDS)
 
 
-def _truth_of_shot(scene: DeviceScene, setup: Setup, shot: ShotGeometry) -> dict[str, Any]:
-    """Return the fields of `Truth` for one shot but `time`, which all shots share."""
-    offset = aim_offset(setup, shot)
-    setup = setup_of_shot(setup, shot)
-    scene = aim_at(scene, setup.lidar, offset)
-    fields = dict(vars(compute_labels(scene, make_waveform_model(setup))))
-    del fields["time"]
-    return fields
+def _truths_of_shots(
+    scene: DeviceScene,
+    model: WaveformModel,
+    atmosphere: Atmosphere | None,
+    shots: ShotGeometry,
+    count: Array,
+) -> dict[str, Any]:
+    """Return the fields of `Truth` but `time` for the first `count` shots, over one device scene."""
 
+    def truth_of_shot(shot: ShotGeometry) -> dict[str, Any]:
+        aimed = aim_shot(scene, model, atmosphere, shot, jax.random.key(0))
+        fields = dict(vars(compute_labels(aimed.scene, aimed.model)))
+        # All shots share it.
+        del fields["time"]
+        return fields
 
-def _truths_of_shots(setup: Setup, shots: ShotGeometry) -> dict[str, Any]:
-    """Return the fields of `Truth` but `time` for shots one after the other, over one device scene."""
-    scene = build_device_scene(setup)
-    return jax.lax.map(lambda shot: _truth_of_shot(scene, setup, shot), shots)
+    return map_first_shots(truth_of_shot, shots, count)
 
 
 _compiled_truths = Program(_truths_of_shots, **ONE_CORE)

@@ -10,7 +10,7 @@ import pytest
 
 import jaxlidar as jl
 from jaxlidar.survey.choose_strategy import choose_strategy
-from jaxlidar.survey.per_shot import aim_offset, setup_of_shot, shot_geometry, trace_chunk
+from jaxlidar.survey.per_shot import aim_offset, lidar_of_shot, shot_geometry, trace_chunk
 from jaxlidar.trace.device_scene import aim_at, build_device_scene
 from jaxlidar.trace.first.first_order import first_order
 from jaxlidar.trace.first.footprint import RaySlice, fibonacci_disc, interleaving_shifts, make_beam
@@ -191,8 +191,8 @@ def test_parts_of_many_shots_are_those_of_single_ones(precision, shots_of):
     @eqx.filter_jit
     def trace_by_both_ways():
         scene = build_device_scene(setup, derivatives="none")
-        offsets = jax.vmap(lambda shot: aim_offset(setup, shot))(shots)
-        beams = jax.vmap(lambda shot: make_beam(setup_of_shot(setup, shot).lidar))(shots)
+        offsets = jax.vmap(lambda shot: aim_offset(setup.lidar, shot))(shots)
+        beams = jax.vmap(lambda shot: make_beam(lidar_of_shot(setup.lidar, shot)))(shots)
         aims = jnp.pad(offsets - offsets[:1], ((0, 0), (0, 3 - offsets.shape[1])))
         first_aim, tally = aim_at(scene, setup.lidar, offsets[0]), empty_tally(scene, 3)
         # In two chunks, which are added to one tally: they have 0.3 and 0.7 of the energy.
@@ -203,7 +203,7 @@ def test_parts_of_many_shots_are_those_of_single_ones(precision, shots_of):
 
         def trace_alone(lattice):
             shot, offset, beam, shift, ray_slice = lattice
-            aimed = aim_at(scene, setup_of_shot(setup, shot).lidar, offset)
+            aimed = aim_at(scene, lidar_of_shot(setup.lidar, shot), offset)
             return first_order(aimed, *fibonacci_disc(beam, n_rays, shift, ray_slice))
 
         return together, jax.lax.map(trace_alone, (shots, offsets, beams, shifts, slices))
@@ -246,7 +246,7 @@ def test_results_do_not_depend_on_which_shots_are_traced_together():
     strategy = strategy_of(narrow_shots(20), edge())
     chunks = [shot_geometry(strategy.survey, first, count) for first, count in ((0, 20), (3, 9))]
     all_shots, nine_shots = (
-        trace_chunk(strategy.setup, chunk, 0.1, strategy.kept_names, strategy.resolves_edges, KEY)
+        trace_chunk(strategy.context, chunk, 0.1, strategy.kept_names, strategy.resolves_edges, KEY)
         for chunk in chunks
     )
     assert np.ptp(np.asarray(all_shots.error)) > 0
