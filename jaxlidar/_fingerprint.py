@@ -4,8 +4,8 @@ Arrays enter a digest by type, shape and every bit; instances of dataclasses by 
 included, but without fields that do not count in comparisons; other objects by what pickle would store.
 
 Functions and classes of installed packages enter by name. Those of the user enter by their code, with its
-constants, defaults, closures, and the globals that it names. A module of the user enters by its file: for
-`helpers.double(x)`, that of `helpers`, but not the files that `helpers` imports in turn.
+constants, defaults, closures, and the globals and imports that it names. A module of the user enters by its
+file and those of all modules of the user that it imports, directly or by way of others.
 """
 
 import copyreg
@@ -13,11 +13,12 @@ import dataclasses
 import dis
 import hashlib
 import importlib.metadata
+import importlib.util
 import inspect
 import pickle
 import platform
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from types import BuiltinFunctionType, CellType, CodeType, FunctionType, ModuleType
 from typing import Any
@@ -112,7 +113,7 @@ def _decompose(x: Any) -> tuple[Any, list[Any]]:
             return type(x).__qualname__, list(x)
         case ModuleType():
             is_installed = _is_installed(x.__name__)
-            return (x.__name__, _release_of(x.__name__) if is_installed else _source_of(x)), []
+            return (x.__name__, _release_of(x.__name__) if is_installed else _sources_of([x.__name__])), []
         case type() | FunctionType() | BuiltinFunctionType() if _is_installed(x.__module__):
             # A function that a package's function returned may hold objects of the user in its closure.
             is_local = "<locals>" in x.__qualname__
@@ -123,7 +124,9 @@ def _decompose(x: Any) -> tuple[Any, list[Any]]:
         case FunctionType():
             names = [n for n in _globals_of(x.__code__) if n in x.__globals__]
             used = [*map(_content, x.__closure__ or ()), *(x.__globals__[n] for n in names)]
-            return (x.__qualname__, names), [x.__code__, x.__defaults__, x.__kwdefaults__, *used]
+            imported = _imports_of(x.__code__, x.__globals__.get("__package__") or "")
+            head = (x.__qualname__, names, _sources_of(imported))
+            return head, [x.__code__, x.__defaults__, x.__kwdefaults__, *used]
         case CodeType():
             names = x.co_names, x.co_varnames, x.co_freevars, x.co_cellvars, x.co_flags, x.co_exceptiontable
             return (x.co_code, *names), list(x.co_consts)
@@ -148,8 +151,21 @@ def _decompose(x: Any) -> tuple[Any, list[Any]]:
 def _is_installed(module: str | None) -> bool:
     """Return True if a module belongs to an installed package, for which its release stands."""
     module = module or "builtins"
-    path = getattr(sys.modules.get(module), "__file__", None) or ""
-    return module.partition(".")[0] in _INSTALLED or "site-packages" in path or "dist-packages" in path
+    if module.partition(".")[0] in _INSTALLED:
+        return True
+    path = _file_of(module) or ""
+    return "site-packages" in path or "dist-packages" in path
+
+
+def _file_of(module: str) -> str | None:
+    """Return the path of a module's file, imported or not; None for one without, and for what is none."""
+    if module in sys.modules:
+        return getattr(sys.modules[module], "__file__", None)
+    try:
+        spec = importlib.util.find_spec(module)
+    except (ImportError, AttributeError, ValueError):
+        return None
+    return None if spec is None or not spec.has_location else spec.origin
 
 
 def _release_of(module: str | None) -> str:
@@ -158,10 +174,43 @@ def _release_of(module: str | None) -> str:
     return "" if package in _INSTALLED else version_of(package)
 
 
-def _source_of(module: ModuleType) -> bytes:
-    """Return the content of a module's file, if it has one."""
-    path = getattr(module, "__file__", None)
-    return Path(path).read_bytes() if path else b""
+def _sources_of(modules: Iterable[str]) -> dict[str, str]:
+    """Return the digest of the file of each module of the user, and of all that these import, by module."""
+    digests: dict[str, str] = {}
+    pending = list(modules)
+    while pending:
+        name = pending.pop()
+        path = None if name in digests or _is_installed(name) else _file_of(name)
+        if path is None:
+            continue
+        source = Path(path).read_bytes()
+        digests[name] = hashlib.sha256(source).hexdigest()
+        if path.endswith(".py"):
+            package = name if Path(path).name == "__init__.py" else name.rpartition(".")[0]
+            pending += _imports_of(compile(source, path, "exec"), package)
+    return dict(sorted(digests.items()))
+
+
+def _imports_of(code: CodeType, package: str) -> set[str]:
+    """Return the names of the modules that code of a package imports, nested functions included."""
+    names, constants, base = set(), [], ""
+    for instruction in dis.get_instructions(code):
+        match instruction.opname:
+            case "LOAD_CONST" | "LOAD_SMALL_INT":
+                constants.append(instruction.argval)
+            case "IMPORT_NAME":
+                # Two constants precede it: the number of leading dots, and the names that are imported.
+                level = constants[-2]
+                base = "." * level + instruction.argval
+                base = importlib.util.resolve_name(base, package) if level else base
+                names.add(base)
+            case "IMPORT_FROM":
+                names.add(f"{base}.{instruction.argval}")
+    for constant in code.co_consts:
+        if isinstance(constant, CodeType):
+            names |= _imports_of(constant, package)
+    # Names that a module defines are among these; they have no file.
+    return names
 
 
 def _members(kind: type) -> Iterator[Any]:

@@ -283,6 +283,40 @@ def test_rules_for_derivatives_count():
     assert digest_of(squared(2.0)) == digest_of(squared(2.0)) != digest_of(squared(2.1))
 
 
+USERS_OF_B = {
+    "a module": ("import my_b\n", "my_a"),
+    "by way of another": ("import my_c\n", "my_a"),
+    "within a function": ("def scale(x):\n    import my_b\n    return my_b.scale(x)\n", "my_a"),
+    "a name": ("from my_b import scale\n", "my_a"),
+    "a function that is called": ("import my_b\ndef use(x):\n    return my_b.scale(x)\n", "my_a.use"),
+    "a function that imports": ("def use(x):\n    from my_b import scale\n    return scale(x)\n", "my_a.use"),
+    "a method": ("import my_c\nclass Law:\n    def use(self, x):\n        return my_c.b(x)\n", "my_a.Law"),
+}
+
+
+@pytest.mark.parametrize("form", USERS_OF_B)
+def test_files_that_files_of_a_user_import_count(form, tmp_path, monkeypatch):
+    """`my_a` uses `my_b`, directly or by way of `my_c`: another `my_b` is another problem."""
+    monkeypatch.syspath_prepend(tmp_path)
+    source, name = USERS_OF_B[form]
+    (tmp_path / "my_a.py").write_text(source)
+    (tmp_path / "my_c.py").write_text("import numpy, my_b, my_a\ndef b(x):\n    return my_b.scale(x)\n")
+
+    def digest(line):
+        (tmp_path / "my_b.py").write_text(line)
+        for module in ("my_a", "my_b", "my_c"):
+            monkeypatch.delitem(sys.modules, module, raising=False)
+        importlib.invalidate_caches()
+        x = importlib.import_module("my_a")
+        for attribute in name.split(".")[1:]:
+            x = getattr(x, attribute)
+        return digest_of(x)
+
+    double, other, again = map(digest, ("scale = abs\n# 2\n", "scale = abs\n# 33\n", "scale = abs\n# 2\n"))
+    assert double == again
+    assert double != other
+
+
 def test_modules_of_a_user_are_identified_by_their_file(tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(tmp_path)
     digests = []
