@@ -19,6 +19,7 @@ from jaxlidar.planning.path_lengths import PathLengths
 from jaxlidar.planning.plan import MIN_BATCHES
 from jaxlidar.planning.plan import plan as make_plan
 from jaxlidar.planning.setup import Setup, make_setup
+from jaxlidar.planning.size_buckets import size_bucket
 from jaxlidar.sampling.adaptive import (
     BATCH_STEPS,
     AbstractEstimate,
@@ -31,7 +32,7 @@ from jaxlidar.sampling.moments import RunningMoments
 from jaxlidar.scenes.scene import Scene, check_kinds
 from jaxlidar.sensors.lidar import Lidar
 from jaxlidar.spectral.apply_optics import budget_excess, refuse_excess, setup_optics
-from jaxlidar.trace.device_scene import build_device_scene
+from jaxlidar.trace.device_scene import DeviceScene, build_device_scene
 from jaxlidar.trace.photons.absorption import (
     EnergyFractions,
     from_beam,
@@ -137,9 +138,12 @@ def energy_budget(
     plan = make_plan(lidar, scene, max_orders=1, effects=effects, describe=False)
     setup = _with_longest_flights(make_setup(lidar, scene, plan))
     start_time = time.perf_counter()
+    # Built here: a program that took the setup would be compiled for every number of voxels.
+    device_scene, optics = build_device_scene(setup, derivatives="none"), setup_optics(setup)
 
     def trace_batch(number: int) -> EnergyFractions:
-        return _compiled_trace(setup, jax.random.fold_in(key, number), illumination == "parallel", max_orders)
+        batch_key = jax.random.fold_in(key, number)
+        return _compiled_trace(device_scene, optics, batch_key, illumination == "parallel", max_orders)
 
     with side_by_side() as run:
         estimate = _BudgetEstimate(lambda numbers: run(trace_batch, numbers))
@@ -215,23 +219,26 @@ def _by_name(fractions: Any, materials: Sequence[str]) -> dict[str, Float[Array,
 def _with_longest_flights(setup: Setup) -> Setup:
     """Follow flights as far as they may go, whatever the record's window is."""
     canopy, plan = setup.scene.canopy, setup.plan
-    # Neither the albedo nor the tolerance of the plan matters here: scenes share the program.
-    plan = dataclasses.replace(plan, rtol=1.0, scope=dataclasses.replace(plan.scope, albedo=1.0))
-    setup = dataclasses.replace(setup, plan=plan)
     if canopy is None or canopy.sides == "open":
         return setup
     lengths = PathLengths(setup.lidar, setup.scene)
     height = concrete_number(canopy.voxels.voxel_size[2]) * canopy.voxels.shape[2]
     max_flight = min(MAX_FLIGHT_HEIGHTS * height, lengths.longest_affordable_flight)
-    plan = plan.with_limits(max_flight=max_flight).with_config(max_faces=lengths.voxels_along(max_flight))
+    plan = plan.with_limits(max_flight=max_flight).with_config(
+        max_faces=size_bucket(lengths.voxels_along(max_flight))
+    )
     return dataclasses.replace(setup, plan=plan)
 
 
-def _trace(setup: Setup, key: PRNGKeyArray, parallel: bool, max_orders: int) -> EnergyFractions:
+def _trace(
+    scene: DeviceScene,
+    optics: Float[Array, "channels wavelengths"],
+    key: PRNGKeyArray,
+    parallel: bool,
+    max_orders: int,
+) -> EnergyFractions:
     """Trace one batch; where leaves transmit straight on, once for each wavelength."""
     source = from_parallel_light if parallel else from_beam
-    optics = setup_optics(setup)
-    scene = build_device_scene(setup, derivatives="none")
     if scene.straight_transmittance is None:
         return trace_to_end(scene, optics, key, PHOTONS_PER_BATCH, source, max_orders)
 

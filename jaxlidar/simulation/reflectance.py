@@ -54,14 +54,14 @@ from jaxlidar.planning.path_lengths import PathLengths
 from jaxlidar.planning.plan import MIN_BATCHES, Plan
 from jaxlidar.planning.plan import plan as make_plan
 from jaxlidar.planning.plan_check import check_plan
-from jaxlidar.planning.setup import Setup, make_setup
+from jaxlidar.planning.setup import make_setup
 from jaxlidar.planning.size_buckets import size_bucket
 from jaxlidar.sampling.errors import student_widening
 from jaxlidar.scenes.scene import Scene
 from jaxlidar.scenes.terrain import Terrain
 from jaxlidar.sensors.lidar import Lidar
 from jaxlidar.spectral.apply_optics import setup_optics
-from jaxlidar.trace.device_scene import Derivatives, build_device_scene
+from jaxlidar.trace.device_scene import DeviceScene, build_device_scene
 from jaxlidar.trace.first.footprint import bistatic_beam
 from jaxlidar.trace.photons.histories import Histories
 from jaxlidar.trace.response import trace_first, trace_higher
@@ -199,12 +199,14 @@ def reflectance_factor(
     corner, size = _rectangle(setup.scene, area, centre)
     is_transformed = any(is_traced(x) for x in jax.tree.leaves((setup, sun_angles, key)))
     common = {
-        "setup": setup,
+        # Built here: a program that took the setup would be compiled for every number of voxels.
+        "scene": build_device_scene(setup, derivatives="all" if is_transformed else "none"),
+        "optics": setup_optics(setup),
+        "lidar": setup.lidar,
         "sun": _unit_vector(sun_angles),
         "corner": corner,
         "size": size,
         "is_hot_spot": is_hot_spot,
-        "derivatives": "all" if is_transformed else "none",
     }
     keys = jax.random.split(key, MIN_BATCHES)
     if is_transformed:
@@ -404,7 +406,7 @@ def _make_plan(
         lengths = PathLengths(lidar, scene)
         height = lengths.size[2] * lengths.shape[2]
         max_faces = max(max_faces, size_bucket(lengths.voxels_along(height / sun_cosine)))
-    # Light that is not followed is in the result, whatever the albedo: brighter scenes share the program.
+    # Light that is not followed is in the result, whatever the albedo.
     plan = dataclasses.replace(plan, scope=dataclasses.replace(plan.scope, albedo=1.0))
     return plan.with_limits(start_distance=float(start_distance)).with_config(
         vertical=is_vertical, max_faces=max_faces
@@ -428,22 +430,20 @@ def _relief(scene: Scene) -> float:
 
 def _trace_batch(
     *,
-    setup: Setup,
+    scene: DeviceScene,
+    optics: Float[Array, "channels wavelengths"],
+    lidar: Lidar,
     sun: Vec,
     corner: Float[Array, "2"],
     size: Float[Array, "2"],
     is_hot_spot: bool,
-    derivatives: Derivatives,
     key: PRNGKeyArray,
 ) -> tuple[Float[Array, " wavelengths"], Float[Array, " wavelengths"]]:
     """Trace one batch.
 
     **Returns:** the reflectance factor, and the fraction of the light that was not followed to its end.
     """
-    scene = build_device_scene(setup, derivatives=derivatives)
-    beam = bistatic_beam(setup.lidar, None if is_hot_spot else sun, corner, size)
-    scene = dataclasses.replace(scene, beam=beam)
-    optics = setup_optics(setup)
+    scene = dataclasses.replace(scene, beam=bistatic_beam(lidar, None if is_hot_spot else sun, corner, size))
     higher = trace_higher(scene, key)
 
     def of_wavelengths(weights: Float[Array, "traces *materials histories"], table: Histories) -> Array:

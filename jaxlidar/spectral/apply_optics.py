@@ -111,7 +111,7 @@ class WaveformModel(eqx.Module):
         return _range_factor(self.lidar, self.bin_start, self.bin_width, self.convolution.n_bins)
 
     def aimed(
-        self, lidar: Lidar, atmosphere: Atmosphere | None, start_distance: Float[Array, ""]
+        self, lidar: Lidar, atmosphere: Atmosphere | None, start_distance: float | Float[Array, ""]
     ) -> "WaveformModel":
         """Return the model for a lidar of another place or direction, through an atmosphere.
 
@@ -122,7 +122,7 @@ class WaveformModel(eqx.Module):
         n_bins = self.convolution.n_bins
         fine_time = self.bin_start + self.bin_width * jnp.arange(n_bins, dtype=self.bin_width.dtype)
         transmittance, fine_air_return = _compiled_atmosphere(
-            atmosphere, lidar, fine_time, start_distance, self.bin_width
+            atmosphere, lidar, fine_time, as_array(start_distance), self.bin_width
         )
         air_return = air_relative_energy = None
         if fine_air_return is not None:
@@ -283,7 +283,7 @@ def _make_model(
         one_order=not plan.config.follows_higher_orders,
         can_scatter_again=allows_interreflection(setup.scene),
     )
-    return model.aimed(setup.lidar, setup.scene.atmosphere, as_array(plan.limits.start_distance))
+    return model.aimed(setup.lidar, setup.scene.atmosphere, plan.limits.start_distance)
 
 
 def _atmosphere_in_bins(

@@ -129,7 +129,7 @@ class ShotGeometry(NamedTuple):
     def padded_to(self, size: int) -> "ShotGeometry":
         """Return `size` shots: these, and copies of the last one."""
         rows = np.minimum(np.arange(size), len(self.number) - 1)
-        return ShotGeometry(*(None if a is None else np.asarray(a)[rows] for a in self))
+        return jax.tree.map(lambda a: np.asarray(a)[rows], self)
 
 
 def shot_geometry(survey: Survey, first: int, count: int) -> ShotGeometry:
