@@ -21,7 +21,7 @@ from jaxlidar.io import (
     read_gedi_l1b,
     read_las,
     read_las_waveforms,
-    read_obj,
+    read_mesh,
     read_pulsewaves,
     read_qsm,
     read_vox,
@@ -702,8 +702,8 @@ TRIANGLE = "v 0 0 0\nv 2 0 0\nv 0 1 0\nf 1 2 3\n"
 def test_units_of_meshes(tmp_path, comment, metres):
     path = tmp_path / "a.obj"
     path.write_text(f"{comment}\n{TRIANGLE}")
-    assert read_obj(path).mesh.area[0] == pytest.approx(metres**2)
-    assert read_obj(path, scale=3.0).mesh.area[0] == pytest.approx(9.0)
+    assert read_mesh(path).mesh.area[0] == pytest.approx(metres**2)
+    assert read_mesh(path, scale=3.0).mesh.area[0] == pytest.approx(9.0)
 
 
 @pytest.mark.parametrize("comment", ["# units: parsec", "# units: cm\n# units: mm"])
@@ -711,7 +711,7 @@ def test_units_of_meshes_that_are_not_known(tmp_path, comment):
     path = tmp_path / "a.obj"
     path.write_text(f"{comment}\n{TRIANGLE}")
     with pytest.raises(ValueError, match=r"a\.obj: lines? 1"):
-        read_obj(path)
+        read_mesh(path)
 
 
 def test_units_of_tree_models(tmp_path):

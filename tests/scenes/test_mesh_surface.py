@@ -323,7 +323,7 @@ def test_case_files_name_files_of_meshes(tmp_path):
     (tmp_path / "case.toml").write_text(
         """
         [[scene.meshes]]
-        mesh = {kind = "read_obj", path = "roof.obj"}
+        mesh = {kind = "read_mesh", path = "roof.obj"}
         reflectance = {tile = 0.4}
         instances = {shift = [[0.0, 0.0, 1.0], [20.0, 0.0, 0.0]]}
         """
