@@ -17,8 +17,8 @@ from jaxlidar.io import (
     read_case,
     read_gedi_l1b,
     read_las_waveforms,
+    read_mesh,
     read_neon,
-    read_obj,
     read_pulsewaves,
     read_qsm,
     read_trajectory,
@@ -147,7 +147,7 @@ def describe_tree(path: Path) -> str:
 
 
 def describe_mesh(path: Path) -> str:
-    mesh, dropped = read_obj(path)
+    mesh, dropped = read_mesh(path)
     areas = np.bincount(mesh.material, mesh.area, len(mesh.materials))
     spans = _spans(mesh.corners.min(axis=(0, 1)), mesh.corners.max(axis=(0, 1)))
     lines = [f"{len(mesh.faces):,} triangles: {spans}"]
@@ -211,7 +211,7 @@ DESCRIPTIONS: dict[str, Callable[[Path], str]] = {
     ".laz": describe_points,
     ".pls": lambda path: describe_shots(read_pulsewaves(path)),
     ".npz": describe_neon,
-    ".obj": describe_mesh,
+    **dict.fromkeys((".obj", ".ply", ".stl", ".gltf", ".glb"), describe_mesh),
     ".h5": describe_gedi,
     **dict.fromkeys((".tif", ".tiff", ".asc"), describe_terrain),
     ".qsm": describe_tree,
@@ -227,7 +227,7 @@ def info(file: Path) -> None:
 
     Known are cases (.toml), results (.nc, .zarr), voxels (.vox), points (.las, .laz), airborne waveforms
     (.las with .wdp, .pls with .wvs, NEON's .npz), GEDI level 1B (.h5), tree models (.qsm, .txt, .csv), meshes
-    (.obj), elevation models (.tif, .tiff, .asc), trajectories and spectra (.csv).
+    (.obj, .ply, .stl, .gltf, .glb), elevation models (.tif, .tiff, .asc), trajectories and spectra (.csv).
 
     \b
     Examples:

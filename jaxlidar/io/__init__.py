@@ -22,9 +22,9 @@ from jaxlidar.io.inventory import read_inventory
 from jaxlidar.io.las import read_las, write_las
 from jaxlidar.io.las_waveforms import read_las_waveforms, write_las_waveforms
 from jaxlidar.io.lvis import read_lvis_l1b, read_lvis_l2
+from jaxlidar.io.meshes import MeshRead, read_mesh
 from jaxlidar.io.neon import NeonImpulse, NeonRead, read_neon
 from jaxlidar.io.netcdf import read_case, save
-from jaxlidar.io.obj import MeshRead, read_obj
 from jaxlidar.io.pulsewaves import read_pulsewaves
 from jaxlidar.io.qsm import TreeRead, read_qsm
 from jaxlidar.io.rasters import write_raster
@@ -70,7 +70,7 @@ __all__ = [
     "read_lvis_l1b",
     "read_lvis_l2",
     "read_neon",
-    "read_obj",
+    "read_mesh",
     "read_pulsewaves",
     "read_qsm",
     "read_trajectory",

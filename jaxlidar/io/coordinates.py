@@ -1,15 +1,15 @@
 """Coordinate reference systems and units of files: what a file declares is used, or the file is refused.
 
 All readers and writers take both from here. A file declares its system as GeoTIFF keys, as well-known text
-(WKT) or by name, and units by name as well. GDAL and PROJ, of the package rasterio, understand systems: their
-axes have directions and units (PROJJSON), so no key and no text is interpreted here. Names of units alone
-have a table.
+(WKT) or by name, and units by name as well. PROJ, by the package pyproj, understands systems, and GDAL, by
+rasterio, GeoTIFF keys: the axes of systems have directions and units, so no key and no text is interpreted
+here. Names of units alone have a table.
 
 A system may leave the unit of heights open, as EPSG:2225 does: its x and y are in feet. The default is in
 `CoordinateSystem.lengths`; for waveforms it is not needed, because light that returns 1 ns later comes from
 0.1499 m farther, in whatever unit (`find_units`).
 
-Source: OGC 19-008r4, GeoTIFF 1.1; OGC 18-010r11, well-known text; the PROJJSON schema of PROJ.
+Source: OGC 19-008r4, GeoTIFF 1.1; OGC 18-010r11, well-known text.
 """
 
 import contextlib
@@ -26,7 +26,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
-from jaxlidar._fields.checks import check_kind
+from jaxlidar._fields.checks import check_kind, warn_user
 from jaxlidar.io.checks import TWO_WAY_METRES_PER_NS, TWO_WAY_TOLERANCE
 
 # Numbers of the variable length records of LAS and PulseWaves files that declare the system: GeoTIFF keys
@@ -79,8 +79,10 @@ _HEIGHT_UNITS = (0.1, 1.0)
 _UNIT_TOLERANCE = 1e-8
 # WGS-84: semi-major axis in m, and squared eccentricity.
 _SEMI_MAJOR_AXIS, _ECCENTRICITY2 = 6378137.0, 0.00669437999014
-# Longitude, latitude and height above the ellipsoid of WGS-84.
-GEOGRAPHIC_3D = "EPSG:4979"
+# Longitude and latitude, and those with height above the ellipsoid, of WGS-84.
+GEOGRAPHIC, GEOGRAPHIC_3D = "EPSG:4326", "EPSG:4979"
+# Accuracy, m, of a transformation of which nothing is said.
+_FINE_ACCURACY = 0.1
 # No unit of length has so many metres; a degree, or a gradian, of latitude has some 1e5.
 _MIN_METRES_PER_ANGLE = 1e4
 # Elevations in m from which light returns: from the deepest trench to the highest clouds.
@@ -99,7 +101,7 @@ class CoordinateSystem:
       "geocentric" for coordinates from the centre of the Earth.
     - `horizontal`: m per unit of x and y; of a geographic system, rad per unit. None: not declared.
     - `vertical`: m per unit of height. None: not declared.
-    - `crs`: the `rasterio.CRS`. None: no system is declared.
+    - `crs`: the `pyproj.CRS`. None: no system is declared.
     """
 
     name: str = "no coordinate reference system"
@@ -112,18 +114,26 @@ class CoordinateSystem:
     @functools.cached_property
     def text(self) -> str | None:
         """The system as a code, or as WKT; None if none is declared."""
-        return None if self.crs is None else self._with_same_units(self.crs.to_string())
+        if self.crs is None:
+            return None
+        authority = self.crs.to_authority(min_confidence=100)
+        return self._with_same_units(":".join(authority)) if authority else self.wkt
 
     @property
     def wkt(self) -> str:
         """The system as WKT, of version 1 where that can hold it. There must be one."""
-        return self._with_same_units(self.crs.to_wkt())
+        import pyproj.exceptions
+
+        try:
+            return self._with_same_units(self.crs.to_wkt("WKT1_GDAL"))
+        except pyproj.exceptions.CRSError:
+            return self.crs.to_wkt()
 
     def _with_same_units(self, text: str) -> str:
         """Return the text, or WKT of version 2 where the text does not keep the unit of each axis."""
         copy = system_of_name("crs", text)
         is_same = (copy.horizontal, copy.vertical) == (self.horizontal, self.vertical)
-        return text if is_same else self.crs.to_wkt(version="WKT2_2019")
+        return text if is_same else self.crs.to_wkt()
 
     def horizontal_length(self, location: str) -> float:
         """Return the metres per unit of x and y: the declared ones, otherwise those of heights or 1.
@@ -156,8 +166,8 @@ class CoordinateSystem:
         units = [unit for unit in (self.horizontal, self.vertical) if unit is not None]
         if self.crs is None or self.kind != "map" or all(units_agree(unit, 1.0) for unit in units):
             return self
-        definition = self.crs.to_dict(projjson=True)
-        for system in _systems_with_axes(definition):
+        definition = self.crs.to_json_dict()
+        for system in definition.get("components", [definition.get("source_crs", definition)]):
             for axis in system["coordinate_system"]["axis"]:
                 axis["unit"] = "metre"
             # The code names the system in its own unit.
@@ -177,58 +187,60 @@ def import_rasterio(purpose: str) -> Any:
     return rasterio
 
 
+def import_pyproj(purpose: str) -> Any:
+    """Return the package pyproj. **Raises:** ImportError that names the purpose."""
+    try:
+        import pyproj
+        import pyproj.exceptions
+        import pyproj.transformer
+    except ImportError as error:
+        raise ImportError(f'{purpose} need the package pyproj: pip install "jaxlidar[io]"') from error
+    return pyproj
+
+
 def system_of_crs(location: str, crs: Any) -> CoordinateSystem:
-    """Return the system of a `rasterio.CRS`; None gives one that declares nothing.
+    """Return the system of a `pyproj.CRS`, or of another class that gives WKT; None declares nothing.
 
     **Raises:** ValueError, naming the location in the file, for axes that lead west or south or down, and
     for x and y of different units.
     """
-    if crs is None:
+    if not crs:
         return CoordinateSystem()
-    definition = crs.to_dict(projjson=True)
-    name, kind, horizontal, vertical = definition.get("name") or "an unnamed system", "map", None, None
-    for system in _systems_with_axes(definition):
-        axes, subtype = system["coordinate_system"]["axis"], system["coordinate_system"]["subtype"]
-        upward = [axis for axis in axes if axis["direction"] == "up"]
-        level = [axis for axis in axes if axis["direction"] != "up"]
-        directions = {axis["direction"] for axis in level}
-        if system["type"] == "GeodeticCRS" and subtype == "Cartesian":
+    pyproj = import_pyproj("coordinate reference systems")
+    if not isinstance(crs, pyproj.CRS):
+        # Of rasterio.
+        crs = pyproj.CRS.from_wkt(crs.to_wkt(version="WKT2_2019"))
+    name, kind, horizontal, vertical = crs.name or "an unnamed system", "map", None, None
+    for component in crs.sub_crs_list or [crs]:
+        system = component.source_crs if component.is_bound else component
+        coordinates = system.coordinate_system.name
+        upward = [axis for axis in system.axis_info if axis.direction == "up"]
+        level = [axis for axis in system.axis_info if axis.direction != "up"]
+        directions = {axis.direction for axis in level}
+        if system.is_geocentric:
             kind, upward = "geocentric", level
-        elif subtype == "ellipsoidal":
+        elif coordinates == "ellipsoidal":
             kind = "geographic"
-        elif subtype not in ("Cartesian", "vertical"):
-            raise ValueError(f"{location}: {subtype} coordinates ({name}) are not read")
+        elif coordinates not in ("cartesian", "vertical"):
+            raise ValueError(f"{location}: {coordinates} coordinates ({name}) are not read")
         # Both axes of a polar projection lead south, or north.
         if directions & {"down", "west"} or (directions & {"south"} and len(directions) > 1):
             raise ValueError(
                 f"{location}: axes to the {' and '.join(sorted(directions))} ({name}); read are those to the "
                 "east, north and up"
             )
-        units = {_unit_size(axis.get("unit")) for axis in level}
+        units = {_unit_size(axis) for axis in level}
         if len(units) > 1:
             raise ValueError(f"{location}: x and y have different units ({name})")
         horizontal = units.pop() if units else horizontal
-        vertical = _unit_size(upward[0].get("unit")) if upward else vertical
+        vertical = _unit_size(upward[0]) if upward else vertical
     return CoordinateSystem(name, kind, horizontal, vertical, crs)
 
 
-def _systems_with_axes(definition: dict[str, Any]) -> Iterator[dict[str, Any]]:
-    """Yield the single systems of a PROJJSON definition: the components of a compound one."""
-    if "components" in definition:
-        for component in definition["components"]:
-            yield from _systems_with_axes(component)
-    elif "source_crs" in definition:
-        yield from _systems_with_axes(definition["source_crs"])
-    else:
-        yield definition
-
-
-def _unit_size(unit: Any) -> float | None:
-    """Return the size of a unit of PROJJSON in m or rad; None for one that GDAL did not find in a file."""
-    if isinstance(unit, dict):
-        is_unknown = unit["name"] == "unknown" and unit["conversion_factor"] == 1
-        return None if is_unknown else float(unit["conversion_factor"])
-    return {"metre": 1.0, "degree": math.pi / 180.0}.get(unit)
+def _unit_size(axis: Any) -> float | None:
+    """Return the size of an axis's unit in m or rad; None for one that GDAL did not find in a file."""
+    is_unknown = axis.unit_name == "unknown" and axis.unit_conversion_factor == 1
+    return None if is_unknown else axis.unit_conversion_factor
 
 
 def units_agree(a: float, b: float) -> bool:
@@ -242,11 +254,10 @@ def system_of_name(field: str, name: str) -> CoordinateSystem:
     **Raises:** TypeError where it is no string; ValueError for a name that PROJ does not know.
     """
     check_kind(field, name, str, "the name of a coordinate reference system, or None")
-    rasterio = import_rasterio("reference systems")
+    pyproj = import_pyproj("coordinate reference systems")
     try:
-        with rasterio.Env():
-            crs = rasterio.CRS.from_user_input(name)
-    except rasterio.errors.CRSError as error:
+        crs = pyproj.CRS.from_user_input(name)
+    except pyproj.exceptions.CRSError as error:
         raise ValueError(f"{field} = {name!r} is not known ({error})") from error
     return system_of_crs(f"{field} = {name!r}", crs)
 
@@ -263,6 +274,56 @@ def metric_system(field: str, name: str) -> CoordinateSystem:
             f"{field} = {name!r} is not in metres; admissible is a projected system, such as EPSG:32633"
         )
     return system
+
+
+def transform(
+    location: str, source: Any, target: Any, *coordinates: Float[np.ndarray, " n"]
+) -> Float[np.ndarray, "n axes"]:
+    """Transform coordinates, x or longitude first, from one system to another; not finite where impossible.
+
+    **Warns:** UserWarning, naming the location in the file, with the accuracy that PROJ states for the
+    transformation, where that is coarser than 0.1 m or unknown, and with the file of a better one that is not
+    installed. Conversions within one datum, as from longitude and latitude to UTM, are exact.
+    """
+    pyproj = import_pyproj("transformations of coordinates")
+    source, target = pyproj.CRS.from_user_input(source), pyproj.CRS.from_user_input(target)
+    with warnings.catch_warnings():
+        # That the best one is not installed is said below, with what its lack costs.
+        warnings.simplefilter("ignore")
+        transformer = pyproj.Transformer.from_crs(source, target, always_xy=True)
+    result = np.stack(transformer.transform(*coordinates), axis=-1)
+    operation = transformer.get_last_used_operation()
+    accuracy = operation.accuracy
+    # PROJ takes two datums for the same one where it knows no transformation between them.
+    if "Ballpark" in operation.description and all(_has_datum(crs) for crs in (source, target)):
+        accuracy = math.inf
+    if accuracy > _FINE_ACCURACY:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            group = pyproj.transformer.TransformerGroup(source, target, always_xy=True)
+        better = [o for o in group.unavailable_operations if 0 <= o.accuracy < accuracy]
+        grids = [grid.short_name for operation in better for grid in operation.grids]
+        warn_user(
+            f"{location}: the accuracy of the transformation from {source.name} to {target.name} is "
+            f"{'not known' if math.isinf(accuracy) else f'{accuracy:g} m'}"
+            + (f"; a better one needs a file that `projsync --file {grids[0]}` installs" if grids else ""),
+            UserWarning,
+        )
+    return result
+
+
+def _has_datum(crs: Any) -> bool:
+    """Return True if a system names its datum, which parameters of an ellipsoid alone do not."""
+    return crs.datum is None or not crs.datum.name.lower().startswith(("unknown", "unnamed"))
+
+
+def directions_of_north(
+    crs: Any, x: Float[np.ndarray, " n"], y: Float[np.ndarray, " n"]
+) -> Float[np.ndarray, " n"]:
+    """Return the direction of a map's north at places on it, in degrees clockwise from true north."""
+    projection = import_pyproj("headings from true north").Proj(crs)
+    longitude, latitude = projection(x, y, inverse=True)
+    return np.asarray(projection.get_factors(longitude, latitude).meridian_convergence)
 
 
 def unit_length(location: str, unit: str | None) -> float | None:
@@ -378,11 +439,10 @@ def _combine(location: str, a: CoordinateSystem, b: CoordinateSystem) -> Coordin
 
 
 def _system_of_wkt(location: str, text: str) -> CoordinateSystem:
-    rasterio = import_rasterio("files that declare a coordinate reference system")
+    pyproj = import_pyproj("files that declare a coordinate reference system")
     try:
-        with rasterio.Env():
-            crs = rasterio.CRS.from_wkt(text)
-    except rasterio.errors.CRSError as error:
+        crs = pyproj.CRS.from_wkt(text)
+    except pyproj.exceptions.CRSError as error:
         raise ValueError(
             f"{location}: its coordinate reference system {text[:60]!r} is not known ({error})"
         ) from error
@@ -560,10 +620,8 @@ def geographic_lines(
     returns at `time`, ns, so that they are exact there. At d metres from there they are off by d^2 / 2R, with
     R the radius of the Earth: by 0.2 mm over 50 m.
     """
-    from rasterio.warp import transform
-
     touching = anchor + time[:, None] * direction
-    place = np.stack(transform(system.crs, GEOGRAPHIC_3D, *touching.T), axis=-1)
+    place = transform("geocentric coordinates", system.crs, GEOGRAPHIC_3D, *touching.T)
     longitude, latitude = np.deg2rad(place[:, :2]).T
     east = np.stack([-np.sin(longitude), np.cos(longitude), np.zeros_like(longitude)], axis=-1)
     up = np.stack(

@@ -33,7 +33,7 @@ from jaxlidar._fields.checks import (
 )
 from jaxlidar._fingerprint import version_of
 from jaxlidar.io.checks import MAX_COUNTS
-from jaxlidar.io.coordinates import metric_system
+from jaxlidar.io.coordinates import GEOGRAPHIC, directions_of_north, metric_system, transform
 from jaxlidar.io.files import atomic_write
 from jaxlidar.sensors.lidar import Lidar
 from jaxlidar.sensors.receiver import Receiver
@@ -83,8 +83,6 @@ _BLOCK = 256
 # altitude, wavelength and the cosine of the zenith angle as fractions. The last one shifts a sample 100 m
 # above the plane by 1 mm.
 _MAX_TURN, _MAX_RELATIVE_DIFFERENCE, _MAX_COSINE_DIFFERENCE = 1e-4, 1e-6, 1e-5
-# Distance in m over which the direction of true north is found.
-_NORTH_BASELINE = 100.0
 
 
 def write_gedi_l1b(
@@ -140,10 +138,13 @@ def write_gedi_l1b(
 
     **Returns:** nothing.
 
-    **Raises:** ImportError without h5py or rasterio, which the extra `io` installs. TypeError for things of
+    **Raises:** ImportError without h5py or pyproj, which the extra `io` installs. TypeError for things of
     another kind. ValueError for several wavelengths, samples that are not 1 ns apart, waveforms of another
     survey, an unknown beam or `crs`, neither or both of `origin` and `crs`, and numbers outside their ranges.
     OSError for a path that cannot be written.
+
+    **Warns:** UserWarning where the transformation from `crs` to WGS-84 has a stated accuracy coarser than
+    0.1 m.
 
     **Source:** GEDI L1B product data dictionary (Dubayah et al. 2020, doi:10.5067/GEDI/GEDI01_B.002).
 
@@ -564,7 +565,8 @@ def _geolocation(
             1e-9 * (2 * altitude / (SPEED_OF_LIGHT * np.cos(zenith)) + time) / 2
         )
     # The product's vector leads from the footprint to the sensor, against the light.
-    towards_sensor = np.remainder(azimuth + _convergence(projection, survey.position), 2 * math.pi) - math.pi
+    north = np.deg2rad(directions_of_north(projection, *survey.position.T))
+    towards_sensor = np.remainder(azimuth + north, 2 * math.pi) - math.pi
     columns["local_beam_azimuth"] = towards_sensor.astype(np.float32)
     columns["local_beam_elevation"] = (0.5 * math.pi - zenith).astype(np.float32)
     columns |= {f"{name}_error": np.zeros(len(survey), np.float32) for name in columns}
@@ -575,9 +577,7 @@ def _geolocation(
 
 def _longitude_latitude(projection: Any, position: Float[np.ndarray, "n 2"]) -> tuple[np.ndarray, np.ndarray]:
     """Return longitude and latitude on WGS-84. **Raises:** ValueError outside the projection."""
-    from rasterio.warp import transform
-
-    longitude, latitude = map(np.array, transform(projection, "EPSG:4326", *position.T))
+    longitude, latitude = transform("position", projection, GEOGRAPHIC, *position.T).T
     outside = ~(np.isfinite(longitude) & np.isfinite(latitude))
     if outside.any():
         shot = int(np.argmax(outside))
@@ -585,16 +585,3 @@ def _longitude_latitude(projection: Any, position: Float[np.ndarray, "n 2"]) -> 
             f"position: shot {shot} at {position[shot].tolist()} m lies outside the projection {projection}"
         )
     return longitude, latitude
-
-
-def _convergence(projection: Any, position: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, " n"]:
-    """Return the direction of the projection's north in rad clockwise from true north.
-
-    It is found from the true direction of a short line along the grid's north, to a hundredth of itself.
-    """
-    half = np.array([0.0, 0.5 * _NORTH_BASELINE])
-    (west, south), (east, north) = (
-        _longitude_latitude(projection, position + side * half) for side in (-1.0, 1.0)
-    )
-    eastward = np.remainder(east - west + 180.0, 360.0) - 180.0
-    return np.arctan2(eastward * np.cos(np.deg2rad(0.5 * (south + north))), north - south)

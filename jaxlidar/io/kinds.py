@@ -16,7 +16,7 @@ from jaxlidar._registry import public_objects
 from jaxlidar.io.dem import DemRead, read_dem
 from jaxlidar.io.inventory import read_inventory
 from jaxlidar.io.las import read_las
-from jaxlidar.io.obj import MeshRead, read_obj
+from jaxlidar.io.meshes import MeshRead, read_mesh
 from jaxlidar.io.qsm import TreeRead, read_qsm
 from jaxlidar.io.trajectory import read_trajectory
 from jaxlidar.io.vox import VoxelsRead, read_vox
@@ -55,7 +55,7 @@ _FUNCTIONS: tuple[Callable[..., Any], ...] = (
     *(VoxelMap.from_lad, VoxelMap.from_extinction, VoxelMap.from_probability),
     *(Survey.grid, Survey.track, Survey.scan, Survey.fly, read_trajectory, instrument),
     *(LeafAngles.named, LeafAngles.beta, Prospect.paper),
-    *(spectrum, read_spectrum_csv, read_vox, read_dem, read_obj, load_coefficients, Coefficients),
+    *(spectrum, read_spectrum_csv, read_vox, read_dem, read_mesh, load_coefficients, Coefficients),
 )
 # Methods among them, with the class of their object and the name of the argument that it is.
 _METHODS = {Stand.above: (Stand, "stand"), VoxelMap.above: (VoxelMap, "voxels")}

@@ -47,9 +47,9 @@ _MAX_EXTRA_TEXT = 32
 def read_las(path: str | os.PathLike[str], *, scale: float | None = None) -> PointCloud:
     """Read the points of a LAS or LAZ file.
 
-    This needs laspy, lazrs for LAZ, and rasterio for files that declare a coordinate reference system
-    (`pip install "jaxlidar[io]"`). Points classified as noise (classes 7 and 18) and those flagged as
-    withheld are dropped and counted.
+    This needs laspy, lazrs for LAZ, and pyproj for files that declare a coordinate reference system, with
+    rasterio where that is by GeoTIFF keys (`pip install "jaxlidar[io]"`). Points classified as noise (classes
+    7 and 18) and those flagged as withheld are dropped and counted.
 
     **Arguments:**
 
@@ -207,11 +207,11 @@ def write_las(
     - `extra`: further numbers by name: (description, (n,) values), written in single precision as extra
       bytes. Names and descriptions have at most 32 bytes. Default None: none.
     - `crs`: the coordinate reference system of `position`, in metres, such as "EPSG:32633". Default None: not
-      known. This needs rasterio.
+      known. This needs pyproj.
 
     **Returns:** nothing.
 
-    **Raises:** ImportError without laspy, without lazrs for LAZ, or without rasterio for `crs`. ValueError
+    **Raises:** ImportError without laspy, without lazrs for LAZ, or without pyproj for `crs`. ValueError
     for another ending, arrays of different lengths, numbers outside their range, names and descriptions
     that are too long, and a `crs` that is not known or not in metres. OSError where the file cannot be
     written.

@@ -89,7 +89,7 @@ def read_pulsewaves(path: str | os.PathLike[str]) -> AirborneShots:
 
     Both files are mapped: a shot is read when it is indexed. Coordinates may be metres, feet or degrees;
     geocentric ones become longitude, latitude and height above the ellipsoid of WGS-84. Files that declare
-    their coordinate reference system need rasterio (`pip install "jaxlidar[io]"`).
+    their coordinate reference system need pyproj, or rasterio (`pip install "jaxlidar[io]"`).
 
     **Arguments:**
 
@@ -105,7 +105,7 @@ def read_pulsewaves(path: str | os.PathLike[str]) -> AirborneShots:
     and the place, for one that is no PulseWaves file, is damaged, compressed, without pulses, or declares
     more than it can hold; when a shot is read, for waves that lie outside of the .wvs file, an unknown
     descriptor, a segment without samples, and a direction that does not have the length that light goes; and
-    for a coordinate reference system that is not known. ImportError without rasterio where one is declared.
+    for a coordinate reference system that is not known. ImportError without pyproj where one is declared.
 
     **Source:** PulseWaves specification 0.3 (rapidlasso).
 

@@ -12,7 +12,16 @@ from jaxtyping import Float
 from jaxlidar._fields.checks import UnitWarning
 from jaxlidar._fields.columns import warn_unread_columns
 from jaxlidar.io.checks import MAX_COORDINATE
-from jaxlidar.io.coordinates import metric_system, system_of_name, unit_angle, unit_length, units_agree
+from jaxlidar.io.coordinates import (
+    GEOGRAPHIC,
+    directions_of_north,
+    metric_system,
+    system_of_name,
+    transform,
+    unit_angle,
+    unit_length,
+    units_agree,
+)
 from jaxlidar.io.text import parse_number, read_lines, split_cells
 from jaxlidar.sensors.trajectory import Trajectory
 
@@ -49,8 +58,6 @@ _OTHER_TIME = re.compile(
 _NAME_AND_UNIT = re.compile(r"\s*(.*?)\s*([\[(][^\])]*[\])])?\s*$")
 # A comment that names a unit of length or a reference system.
 _COMMENT = re.compile(r"\s*#\s*(crs|srs|units?)\s*[:=]\s*(.*?)\s*$", re.IGNORECASE)
-# Half the length, m, of the line along the grid's north whose true direction is taken.
-_HALF_BASELINE = 50.0
 
 
 class _Column(NamedTuple):
@@ -89,7 +96,10 @@ def read_trajectory(path: str | os.PathLike[str], *, crs: str | None = None) -> 
     a column of GPS time is beside them; longitude and latitude, or a true heading, without `crs`, and `crs`
     without these; units that are not known; rows of another length, and cells that are not finite numbers;
     coordinates that are not on Earth; and what a `Trajectory` refuses. ImportError where `crs` is given and
-    `rasterio`, of the extra `io`, is not installed.
+    `pyproj`, of the extra `io`, is not installed.
+
+    **Warns:** UserWarning where longitude and latitude are transformed to a map of another datum with a
+    stated accuracy coarser than 0.1 m.
 
     **Example:**
 
@@ -142,7 +152,8 @@ def read_trajectory(path: str | os.PathLike[str], *, crs: str | None = None) -> 
     yaw = values.get("yaw")
     if yaw is not None and crs is not None:
         # 359.9 degrees from true north may be 361 from the map's.
-        yaw = np.fmod(yaw - _direction_of_north(crs, values["x"], values["y"]), 360.0)
+        projection = metric_system("crs", crs).crs
+        yaw = np.fmod(yaw - directions_of_north(projection, values["x"], values["y"]), 360.0)
     position = np.stack([values[axis] for axis in "xyz"], axis=-1)
     angles = [columns[name] for name in ("roll", "pitch", "yaw") if name in columns]
     try:
@@ -302,29 +313,13 @@ def _projected(
     path: Path, crs: str, longitude: Float[np.ndarray, " n"], latitude: Float[np.ndarray, " n"]
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
     """Return x and y on a map, m."""
-    from rasterio.warp import transform
-
     projection = metric_system("crs", crs).crs
     for name, values, limit in (("longitude", longitude, 360.0), ("latitude", latitude, 90.0)):
         if np.any(np.abs(values) > limit):
             raise ValueError(
                 f"{path}: {name} = {values[np.abs(values) > limit][0]:g} is outside [-{limit:g}, {limit:g}]"
             )
-    x, y = map(np.array, transform("EPSG:4326", projection, longitude, latitude))
+    x, y = transform(str(path), GEOGRAPHIC, projection, longitude, latitude).T
     if not np.all(np.isfinite(x) & np.isfinite(y)):
         raise ValueError(f"{path}: a position lies outside the projection {crs}")
     return x, y
-
-
-def _direction_of_north(
-    crs: str, x: Float[np.ndarray, " n"], y: Float[np.ndarray, " n"]
-) -> Float[np.ndarray, " n"]:
-    """Return the direction of a map's north in degrees clockwise from true north."""
-    from rasterio.warp import transform
-
-    projection = metric_system("crs", crs).crs
-    ends = [transform(projection, "EPSG:4326", x, y + side * _HALF_BASELINE) for side in (-1.0, 1.0)]
-    (west, south), (east, north) = (map(np.array, end) for end in ends)
-    latitude = np.deg2rad(0.5 * (south + north))
-    eastward = (np.remainder(east - west + 180.0, 360.0) - 180.0) * np.cos(latitude)
-    return np.rad2deg(np.arctan2(eastward, north - south))

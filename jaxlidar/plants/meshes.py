@@ -50,8 +50,8 @@ _SNAP_DISTANCE = 1e-9
 class Mesh:
     """A mesh of n triangles over m vertices, each triangle of one of several materials.
 
-    Coordinates are in metres, x east, y north, z up. Arrays are NumPy arrays. `jaxlidar.io.read_obj` reads
-    one; one of the package trimesh, which reads many formats, is `Mesh(other.vertices, other.faces)`.
+    Coordinates are in metres, x east, y north, z up. Arrays are NumPy arrays. `jaxlidar.io.read_mesh` reads
+    one from a file.
 
     **Arguments:**
 
@@ -305,7 +305,7 @@ def voxelise_mesh(
     >>> print(voxels.shape, f"{2 * voxels.leaf[0, 0, 0]:.3f} m2 per m3")
     (2, 1, 2) 1.414 m2 per m3
     """
-    check_kind("mesh", mesh, Mesh, "a Mesh, such as jaxlidar.io.read_obj gives")
+    check_kind("mesh", mesh, Mesh, "a Mesh, such as jaxlidar.io.read_mesh gives")
     size = voxel_edges(voxel_size)
     is_bark = mesh.of(bark)
     is_leaf = ~is_bark if leaf is None else mesh.of(leaf)

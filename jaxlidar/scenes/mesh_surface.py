@@ -63,6 +63,8 @@ MAX_TRIANGLES = 1 << 28
 _INSTANCE_ROUNDING = 16.0
 # Largest rounding of a corner: in units of the longest edge of its triangle, if it is more than so many m.
 _EDGE_ROUNDING, _LEAST_ROUNDING = 0.01, 1e-4
+# A mesh this far from its origin, m, and in units of its own size, lies there in coordinates of a map.
+_FAR_FROM_ORIGIN, _FAR_IN_SIZES = 1e3, 10.0
 # Rounding of a point on a triangle, in units of the floating-point precision and of its coordinates.
 _POSITION_ROUNDING = 8.0
 # Periods by which copies of an instance that crosses sides of a cell lie away from it.
@@ -84,6 +86,9 @@ def _coordinates(field: str, x: Any, columns: int) -> Array | np.ndarray:
 @final
 class MeshInstances(eqx.Module):
     """Places of copies of a mesh: each is scaled and rotated about the mesh's own origin, then shifted.
+
+    The origin is the point (0, 0, 0) of the mesh's coordinates. A `MeshSurface` refuses to rotate or scale a
+    mesh in coordinates of a map about their distant origin.
 
     **Arguments:**
 
@@ -168,7 +173,8 @@ class MeshSurface(eqx.Module):
 
     - `mesh`: a `Mesh`, a `trimesh.Trimesh`, another object with `vertices` (m, 3) and `faces` (n, 3), or a
       tuple of these two arrays: positions in m, and indices of the corners of each triangle, which are
-      anticlockwise as seen from the front side. A `Mesh` has materials by group of faces.
+      anticlockwise as seen from the front side. A `Mesh` has materials by group of faces. Where a trimesh
+      declares its `units`, its positions are converted to m.
     - `reflectance`: one number, one per wavelength, or a `Spectrum`, in [0, 1], for all triangles; or a dict
       of such, by name of material. Default 0.3.
     - `transmittance`: the same. The sum of reflectance and transmittance is at most 1. Default 0: opaque.
@@ -184,8 +190,9 @@ class MeshSurface(eqx.Module):
 
     **Raises:** ValueError for arrays of other shapes, no triangle with an area, more than 2^28 triangles,
     positions that are not finite, triangles so small and so far from the middle of their mesh that their
-    corners are rounded by more than 1 % of their edges, indices of vertices that do not exist, optics outside
-    [0, 1], names that the mesh does not have, and a mirror; TypeError for objects of another kind and for
+    corners are rounded by more than 1 % of their edges, indices of vertices that do not exist, instances that
+    rotate or scale a mesh about a distant origin, optics outside [0, 1], names that the mesh does not have,
+    unknown units, and a mirror; TypeError for objects of another kind and for
     vertices that JAX is tracing: make the surface outside, and replace its `vertices` by `equinox.tree_at`.
 
     **Example:** a roof over ground.
@@ -252,6 +259,7 @@ class MeshSurface(eqx.Module):
         numbers = np.searchsorted(np.unique(group), group) if by_material else np.zeros(len(faces), int)
         self.group = numbers[order].astype(np.int32)
         self.instances = MeshInstances(np.zeros((1, 3))) if instances is None else instances
+        _check_origin(vertices, self.instances)
         self.period = None
 
     @property
@@ -353,6 +361,10 @@ def _mesh_arrays(
     if isinstance(mesh, tuple | list) and len(mesh) == 2:
         vertices, faces = mesh
     elif not isinstance(mesh, tuple | list) and hasattr(mesh, "vertices") and hasattr(mesh, "faces"):
+        if getattr(mesh, "units", None) is not None and hasattr(mesh, "convert_units"):
+            # A `trimesh.Trimesh`.
+            mesh = mesh.copy()
+            mesh.convert_units("meters")
         vertices, faces = mesh.vertices, mesh.faces
         if hasattr(mesh, "materials") and hasattr(mesh, "material"):
             # A `Mesh`, whose package stands above this one.
@@ -383,6 +395,33 @@ def _mesh_arrays(
     if not has_area.any():
         raise ValueError("mesh has no triangle with an area; admissible is one or more")
     return vertices, faces[has_area], group[has_area], names
+
+
+def _check_origin(vertices: Float[np.ndarray, "m 3"], instances: MeshInstances) -> None:
+    """Refuse instances that rotate or scale a mesh in coordinates of a map about their distant origin.
+
+    With m the middle of the mesh, rotation and scale displace it by e = s R m - m, and the shift d by d more.
+    A user who rotates about another point p has d = s (p - R p), which takes most of e back.
+
+    **Raises:** ValueError with the place of the mesh and the displacement.
+    """
+    rotation, scale, shift = (concrete(a) for a in (instances.rotation, instances.scale, instances.shift))
+    low, high = vertices.min(axis=0), vertices.max(axis=0)
+    middle, size = 0.5 * (low + high), 0.5 * float(np.linalg.norm(high - low))
+    if np.linalg.norm(middle) < max(_FAR_FROM_ORIGIN, _FAR_IN_SIZES * size):
+        return
+    if rotation is None or scale is None or shift is None:
+        return
+    displacement = _matrices(np.asarray(rotation, float), np.asarray(scale, float), np) @ middle - middle
+    distance = np.linalg.norm(displacement, axis=1)
+    is_wrong = (distance > size) & (np.linalg.norm(displacement + shift, axis=1) > 0.5 * distance)
+    if is_wrong.any():
+        first = int(np.argmax(is_wrong))
+        raise ValueError(
+            f"instances: number {first} is rotated or scaled about the origin of the mesh, (0, 0, 0), which "
+            f"moves it by {distance[first]:.4g} m from {middle.round(1).tolist()}; subtract a point of the "
+            "mesh from its vertices, and add it to `shift`"
+        )
 
 
 def _check_rounding(vertices: Float[np.ndarray, "m 3"], faces: Int[np.ndarray, "n 3"], eps: float) -> None:

@@ -196,7 +196,7 @@ class DiscreteReturns(eqx.Module):
 
         - `path`: the file, which ends in ".las" or ".laz". Missing folders are created.
         - `crs`: coordinate reference system of the scene, in metres, such as "EPSG:32633". Default None: not
-          known. This needs rasterio.
+          known. This needs pyproj.
 
         **Raises:** as `jaxlidar.io.write_las`; ValueError where there is no return, and for more than 15 of
         one shot (`max_returns` of `Waveforms.returns`).

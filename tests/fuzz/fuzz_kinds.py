@@ -53,6 +53,13 @@ def small_obj() -> bytes:
     return OBJ.encode()
 
 
+def small_mesh(file_type: str) -> bytes:
+    import trimesh
+
+    content = trimesh.creation.box().export(file_type=file_type)
+    return content.encode() if isinstance(content, str) else content
+
+
 def small_spectrum() -> bytes:
     return b"# soil\nwavelength,reflectance\n" + b"".join(b"%d,0.%d\n" % (w, w) for w in range(400, 900, 25))
 
@@ -369,7 +376,22 @@ def small_clouds(*arguments: tuple) -> tuple[Callable[[], bytes], ...]:
 LAZ = small_clouds((True,), (True, 3), (True, 6, 120_000))
 KINDS = {
     "vox": text_kind("read_vox", ".vox", small_vox, plausible_voxels, "voxels/*.vox"),
-    "obj": text_kind("read_obj", ".obj", small_obj, plausible_mesh),
+    "obj": text_kind("read_mesh", ".obj", small_obj, plausible_mesh),
+    **{
+        name: FileKind(
+            "binary",
+            "read_mesh",
+            f".{name}",
+            (lambda name=name: small_mesh(name), *more),
+            change_bytes,
+            plausible_mesh,
+        )
+        for name, more in (
+            ("ply", ()),
+            ("stl", (lambda: small_mesh("stl_ascii"),)),
+            ("glb", ()),
+        )
+    },
     "qsm": text_kind("read_qsm", ".csv", small_qsm, plausible_tree, "voxels/tree_qsm.csv"),
     "trajectory": text_kind("read_trajectory", ".csv", small_trajectory, plausible_trajectory),
     "inventory": text_kind("read_inventory", ".csv", small_inventory, plausible_inventory),

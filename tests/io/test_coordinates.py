@@ -5,8 +5,10 @@ units are those of the EPSG registry: foot 0.3048 m, foot of the US survey 1200/
 gradian pi/200 rad.
 """
 
+import contextlib
 import dataclasses
 import math
+import re
 import struct
 
 import jax
@@ -21,7 +23,7 @@ from jaxlidar.io import (
     read_gedi_l1b,
     read_las,
     read_las_waveforms,
-    read_obj,
+    read_mesh,
     read_pulsewaves,
     read_qsm,
     read_vox,
@@ -29,7 +31,7 @@ from jaxlidar.io import (
     write_las_waveforms,
     write_raster,
 )
-from jaxlidar.io.coordinates import system_of_name, unit_length
+from jaxlidar.io.coordinates import directions_of_north, system_of_name, transform, unit_length
 from tests.io import test_gedi, test_las_waveforms, test_neon, test_pulsewaves
 from tests.io.test_dem import ROWS, write_ascii_grid, write_tiff
 
@@ -132,6 +134,55 @@ def las(folder, content, *, extended=False, number=None, scale=0.001, points=POI
     path = folder / "cloud.las"
     file.write(path)
     return path
+
+
+# -- transformations ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("crs", "says"),
+    [
+        # Of WGS 84, and of an ellipsoid without a datum.
+        ("EPSG:32633", None),
+        ("EPSG:32633+5773", None),
+        ("+proj=utm +zone=33 +ellps=WGS84 +units=m", None),
+        # The registry states 1 m between ETRS89 and WGS 84.
+        ("EPSG:25833", "accuracy of the transformation from WGS 84 to ETRS89 / UTM zone 33N is 1 m"),
+        (wkt("EPSG:25833"), "is 1 m"),
+        # A datum that no transformation leads to.
+        (wkt("EPSG:32633").replace('DATUM["WGS_1984"', 'DATUM["survey of 1970"'), "is not known"),
+    ],
+)
+def test_transformations_say_their_accuracy(tmp_path, crs, says):
+    path = tmp_path / "flight.csv"
+    path.write_text("time,lon,lat,height\n0,15,48,500\n1,15.001,48,500\n")
+    # Names and codes of EPSG in a text would lead to its own datum.
+    if "survey" in crs:
+        crs = re.sub(r',AUTHORITY\["EPSG","\d+"\]', "", crs)
+    caught = contextlib.nullcontext() if says is None else pytest.warns(UserWarning, match=says)
+    with caught:
+        flight = jl.io.read_trajectory(path, crs=crs)
+    # Their ellipsoids differ by 0.1 mm.
+    np.testing.assert_allclose(
+        flight.position[:, :2].T,
+        project("EPSG:4326", "EPSG:32633", [15, 15.001], [48, 48]),
+        rtol=0,
+        atol=1e-3,
+    )
+
+
+def test_a_better_transformation_that_is_not_installed_is_named():
+    """OSTN15 is a file of its own. Without it the datum of Great Britain is known to 2 m."""
+    with pytest.warns(UserWarning, match=r"is \d m; a better one needs a file that `projsync --file uk_os_"):
+        transform("a.csv", "EPSG:4326", "EPSG:27700", np.array([-1.0]), np.array([52.0]))
+
+
+def test_directions_of_north_of_a_conic_map():
+    """Of Lambert-93 the north turns by sin(latitude of the cone) times the longitude from 3 degrees east."""
+    longitude, latitude = np.array([3.0, 8.0, -4.0]), np.array([46.5, 48.0, 44.0])
+    x, y = project("EPSG:4171", "EPSG:2154", longitude, latitude)
+    directions = directions_of_north(system_of_name("crs", "EPSG:2154").crs, np.array(x), np.array(y))
+    np.testing.assert_allclose(directions, 0.7256077650 * (longitude - 3.0), atol=1e-6)
 
 
 # -- point clouds ------------------------------------------------------------------------------------------
@@ -702,8 +753,8 @@ TRIANGLE = "v 0 0 0\nv 2 0 0\nv 0 1 0\nf 1 2 3\n"
 def test_units_of_meshes(tmp_path, comment, metres):
     path = tmp_path / "a.obj"
     path.write_text(f"{comment}\n{TRIANGLE}")
-    assert read_obj(path).mesh.area[0] == pytest.approx(metres**2)
-    assert read_obj(path, scale=3.0).mesh.area[0] == pytest.approx(9.0)
+    assert read_mesh(path).mesh.area[0] == pytest.approx(metres**2)
+    assert read_mesh(path, scale=3.0).mesh.area[0] == pytest.approx(9.0)
 
 
 @pytest.mark.parametrize("comment", ["# units: parsec", "# units: cm\n# units: mm"])
@@ -711,7 +762,7 @@ def test_units_of_meshes_that_are_not_known(tmp_path, comment):
     path = tmp_path / "a.obj"
     path.write_text(f"{comment}\n{TRIANGLE}")
     with pytest.raises(ValueError, match=r"a\.obj: lines? 1"):
-        read_obj(path)
+        read_mesh(path)
 
 
 def test_units_of_tree_models(tmp_path):

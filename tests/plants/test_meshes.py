@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import jaxlidar as jl
-from jaxlidar.io import read_case, read_obj
+from jaxlidar.io import read_case, read_mesh
 from tests.helpers import SINGLE_SAMPLE, single_sample_lidar
 
 trimesh = pytest.importorskip("trimesh")
@@ -191,21 +191,21 @@ def obj_file(tmp_path):
 
 
 def test_an_obj_file(obj_file):
-    mesh, dropped = read_obj(obj_file(OBJ))
+    mesh, dropped = read_mesh(obj_file(OBJ))
     assert mesh.materials == ("green leaf", "stem")
     assert mesh.material.tolist() == [0, 0, 1]
     assert mesh.area.tolist() == [1.0, 1.0, 1.0]
     assert dropped == {"without an area": 1}
-    groups, _ = read_obj(obj_file(OBJ), part="group", scale=0.1, up="y")
+    groups, _ = read_mesh(obj_file(OBJ), part="group", scale=0.1, up="y")
     assert groups.materials == ("unnamed", "lower")
     assert groups.area.sum() == pytest.approx(0.03)
     np.testing.assert_allclose(groups.vertices[0], [0.0, -0.1, 0.0])
-    assert read_obj(obj_file(OBJ), part="object")[0].materials == ("plant",)
+    assert read_mesh(obj_file(OBJ), part="object")[0].materials == ("plant",)
 
 
 def test_an_obj_file_that_trimesh_writes(obj_file):
     sphere = trimesh.creation.icosphere(subdivisions=2)
-    mesh, dropped = read_obj(obj_file(trimesh.exchange.obj.export_obj(sphere, digits=17)))
+    mesh, dropped = read_mesh(obj_file(trimesh.exchange.obj.export_obj(sphere, digits=17)))
     np.testing.assert_array_equal(mesh.vertices, sphere.vertices)
     np.testing.assert_array_equal(mesh.faces, sphere.faces)
     assert mesh.area.sum() == pytest.approx(sphere.area)
@@ -231,12 +231,12 @@ def test_an_obj_file_that_trimesh_writes(obj_file):
 )
 def test_damaged_obj_files(obj_file, change, message):
     with pytest.raises(ValueError, match=rf"plant.obj: {message}"):
-        read_obj(obj_file(OBJ.replace(*change)))
+        read_mesh(obj_file(OBJ.replace(*change)))
 
 
 def test_faces_without_any_area(obj_file):
     with pytest.raises(ValueError, match=r"plant\.obj: line 3: 1 triangles, none with an area"):
-        read_obj(obj_file("v 0 0 0\nv 1 1 1\nf 1 1 2\n"))
+        read_mesh(obj_file("v 0 0 0\nv 1 1 1\nf 1 1 2\n"))
 
 
 def test_a_case_voxelises_a_mesh(obj_file, tmp_path):
@@ -244,7 +244,7 @@ def test_a_case_voxelises_a_mesh(obj_file, tmp_path):
     case = tmp_path / "case.toml"
     case.write_text(
         '[scene.canopy]\nleaf = "Prospect"\nbark = 0.3\n[scene.canopy.voxels]\nkind = "voxelise_mesh"\n'
-        'voxel_size = 0.5\nbark = ["stem"]\nmesh = {kind = "read_obj", path = "plant.obj"}\n'
+        'voxel_size = 0.5\nbark = ["stem"]\nmesh = {kind = "read_mesh", path = "plant.obj"}\n'
     )
     voxels = read_case(case).scene.canopy.voxels
     assert areas(voxels).sum() == pytest.approx(2.0, rel=1e-6)

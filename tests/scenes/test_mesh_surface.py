@@ -278,6 +278,43 @@ def test_inadmissible_instances_are_refused(arguments, says):
         jl.MeshInstances(**arguments)
 
 
+PLACE = np.array([500_000.0, 5_400_000.0, 0.0])
+
+
+@pytest.mark.parametrize("arguments", [{"rotation": [30]}, {"rotation": [0.1]}, {"scale": [1.01]}])
+def test_meshes_on_maps_are_not_rotated_about_the_origin_of_the_map(arguments):
+    on_map = (CORNERS + PLACE, ROOF[1])
+    with pytest.raises(ValueError, match=r"instances: number 0 is rotated or scaled .* from \[500"):
+        jl.MeshSurface(on_map, instances=jl.MeshInstances([[0.0, 0, 0]], **arguments))
+    # In coordinates of its own, or with the shift that rotates it about another point, it stays.
+    local = jl.MeshSurface(ROOF, instances=jl.MeshInstances([PLACE], **arguments))
+    matrix = np.asarray(jl.MeshInstances([[0.0, 0, 0]], **arguments).matrices()[0], float)
+    shift = PLACE - matrix @ PLACE
+    same = jl.MeshSurface(on_map, instances=jl.MeshInstances([shift], **arguments))
+    np.testing.assert_allclose(local.bounds().mean(axis=1), [[*PLACE[:2], 6 * matrix[2, 2]]])
+    np.testing.assert_allclose(same.bounds(), local.bounds(), rtol=0, atol=1.0)
+    jl.MeshSurface(on_map, instances=jl.MeshInstances([[7.0, 8.0, 1.0], PLACE]))
+
+
+def test_small_meshes_beside_their_origin_are_rotated_about_it():
+    """A leaf of 5 cm at the top of its tree."""
+    leaf = (0.005 * CORNERS + np.array([3.0, 0.0, 20.0]), ROOF[1])
+    instances = jl.MeshInstances([[0.0, 0, 0]], rotation=[90])
+    middle = jl.MeshSurface(leaf, instances=instances).bounds().mean(axis=1)
+    np.testing.assert_allclose(middle, [[0.0, -3.0, 20.03]], atol=1e-5)
+
+
+def test_units_of_a_trimesh():
+    box = trimesh.creation.box(bounds=[[0, 0, 0], [2000, 1000, 500]])
+    box.units = "mm"
+    np.testing.assert_allclose(jl.MeshSurface(box).bounds(), [[[0, 0, 0], [2, 1, 0.5]]], rtol=1e-6)
+    assert box.units == "mm"
+    assert box.extents.max() == 2000.0
+    box.units = "ells"
+    with pytest.raises(ValueError, match="ells"):
+        jl.MeshSurface(box)
+
+
 def test_scenes_refuse_what_meshes_do_not_go_with():
     surface = jl.MeshSurface(ROOF)
     voxels = jl.VoxelMap.from_lad(np.ones((2, 2, 2)), voxel_size=1.0)
@@ -299,11 +336,12 @@ def test_scenes_refuse_what_meshes_do_not_go_with():
 def test_case_files_hold_meshes(tmp_path):
     """Exactly: materials, optics by material, one of them a spectrum, and instances."""
     mesh = jl.Mesh(CORNERS + np.array([651_234.5, 0.25, 0.0]), ROOF[1], [1, 0], ["tile", "glass"])
+    shifts = jl.MeshInstances([[0.1, 0.2, 5_412_345.678], [1.0, 2.0, 3.0]])
     instances = jl.MeshInstances([[0.1, 0.2, 5_412_345.678], [1.0, 2.0, 3.0]], [10, 20], [1.0, 0.3])
     reflectance = {"tile": jl.spectrum("soil-medium"), "glass": 0.1}
     meshes = (
-        jl.MeshSurface(mesh, reflectance, {"glass": 0.8}, two_sided=False, instances=instances),
-        jl.MeshSurface(ROOF, 0.25),
+        jl.MeshSurface(mesh, reflectance, {"glass": 0.8}, two_sided=False, instances=shifts),
+        jl.MeshSurface(ROOF, 0.25, instances=instances),
     )
     path = tmp_path / "roof.toml"
     jl.io.write_case(path, jl.io.Case(scene=jl.Scene(meshes=meshes)))
@@ -323,7 +361,7 @@ def test_case_files_name_files_of_meshes(tmp_path):
     (tmp_path / "case.toml").write_text(
         """
         [[scene.meshes]]
-        mesh = {kind = "read_obj", path = "roof.obj"}
+        mesh = {kind = "read_mesh", path = "roof.obj"}
         reflectance = {tile = 0.4}
         instances = {shift = [[0.0, 0.0, 1.0], [20.0, 0.0, 0.0]]}
         """
