@@ -54,7 +54,7 @@ from jaxlidar.spectral.apply_optics import (
     setup_optics,
     total_samples,
 )
-from jaxlidar.survey.results import ShotErrors, ShotResults, make_shot_results
+from jaxlidar.survey.results import ShotErrors, make_shot_results
 from jaxlidar.survey.strategy import AbstractStrategy, Shots, first_rows, slices_of_shots
 from jaxlidar.trace.device_scene import DeviceScene, aim_at, build_device_scene
 from jaxlidar.trace.first.first_order import FirstOrderTally
@@ -206,7 +206,7 @@ class PerShotStrategy(AbstractStrategy):
     def shots_of_task(self, number: int) -> Shots:
         return self.shot_slices[number]
 
-    def results_of_task(self, number: int, result: Any) -> ShotResults:
+    def results_of_task(self, number: int, result: Any) -> dict[str, Any]:
         return first_rows(result, self.shot_slices[number])
 
     def info(self) -> dict[str, Any]:
@@ -220,7 +220,7 @@ def trace_chunk(
     kept_names: tuple[str, ...],
     resolves_edges: bool,
     key: PRNGKeyArray,
-) -> ShotResults:
+) -> dict[str, Any]:
     """Trace a chunk of shots."""
     return compiled_shots(
         setup, shots.in_precision(), key, np.asarray(rtol, jnp.result_type(float)), kept_names, resolves_edges
@@ -268,7 +268,7 @@ def _trace_shot(
     key: PRNGKeyArray,
     rtol: Array,
     kept_names: tuple[str, ...],
-) -> ShotResults:
+) -> dict[str, Any]:
     """Trace one shot until its tolerance is met.
 
     Where nothing is random, that is one batch, whose errors are zero. Otherwise the estimate is refined, by
@@ -289,7 +289,7 @@ def _trace_shot(
 
 def _shot_results(
     aimed: AimedShot, estimate: RunningMoments, kept_names: tuple[str, ...], error_factor: float = 1.0
-) -> ShotResults:
+) -> dict[str, Any]:
     """Return the results of a shot from the moments of its batches.
 
     `error_factor`: standard error over that of batches that are independent.
@@ -409,7 +409,7 @@ def _trace_narrow_shots(
     rtol: Array,
     kept_names: tuple[str, ...],
     resolves_edges: bool,
-) -> ShotResults:
+) -> dict[str, Any]:
     """Trace the lattices of narrow shots, again with more parts for those that are not within the tolerance.
 
     In each round:
@@ -425,22 +425,22 @@ def _trace_narrow_shots(
     most = -(-scene.config.n_rays // RAYS_OF_PART)
     first_parts = jnp.clip(jnp.ceil(LEAST_PARTS_TIMES_RTOL / rtol), 1, most).astype(jnp.int32)
 
-    def is_pending(n_parts: Array, results: ShotResults) -> Array:
-        return (n_parts == 0) | ((results.error > rtol) & (n_parts < max_parts))
+    def is_pending(n_parts: Array, results: dict[str, Any]) -> Array:
+        return (n_parts == 0) | ((results["error"] > rtol) & (n_parts < max_parts))
 
-    def trace_some(numbers: Array, n_parts: Array) -> ShotResults:
+    def trace_some(numbers: Array, n_parts: Array) -> dict[str, Any]:
         shots_of_group = jax.tree.map(lambda a: a[numbers], shots)
         return _trace_together(scene, setup, shots_of_group, n_parts, key, kept_names, error_factor)
 
-    def next_round(state: tuple[Array, ShotResults]) -> tuple[Array, ShotResults]:
+    def next_round(state: tuple[Array, dict[str, Any]]) -> tuple[Array, dict[str, Any]]:
         n_parts, results = state
-        following = jnp.minimum(_LATTICE_STEPS.next_size(n_parts, results.error, rtol), max_parts)
+        following = jnp.minimum(_LATTICE_STEPS.next_size(n_parts, results["error"], rtol), max_parts)
         pending = is_pending(*state)
         n_parts = jnp.where(pending, jnp.where(n_parts == 0, first_parts, following), n_parts)
         # Numbers of the shots, those that are pending first.
         order, n_pending = jnp.argsort(~pending, stable=True), jnp.sum(pending, dtype=jnp.int32)
 
-        def trace_group(group: Array, results: ShotResults) -> ShotResults:
+        def trace_group(group: Array, results: dict[str, Any]) -> dict[str, Any]:
             position = group * _SHOTS_AT_ONCE + jnp.arange(_SHOTS_AT_ONCE, dtype=jnp.int32)
             exists = position < n_pending
             numbers = order[jnp.minimum(position, n_shots - 1)]
@@ -466,7 +466,7 @@ def _trace_together(
     key: PRNGKeyArray,
     kept_names: tuple[str, ...],
     error_factor: float,
-) -> ShotResults:
+) -> dict[str, Any]:
     """Trace the lattices of a group of shots, each in `n_parts` parts.
 
     1. List the parts of all lattices of all shots, shot by shot.
@@ -517,7 +517,7 @@ def _trace_together(
     )
 
     # Step 3.
-    def results_of(shot: ShotGeometry, sums: LatticeSums) -> ShotResults:
+    def results_of(shot: ShotGeometry, sums: LatticeSums) -> dict[str, Any]:
         aimed = _aim_shot(scene, setup, shot, key)
         aimed = aimed._replace(model=aimed.model.for_applied_optics())
         responses = jax.vmap(lambda s: response_of_lattice(scene, s, optics))(sums)
@@ -536,7 +536,7 @@ def _trace_shots(
     rtol: Array,
     kept_names: tuple[str, ...],
     resolves_edges: bool,
-) -> ShotResults:
+) -> dict[str, Any]:
     """Trace shots over one device scene."""
     scene = build_device_scene(setup, derivatives="none")
     if _are_narrow(setup, scene):

@@ -12,12 +12,11 @@ from jaxtyping import Int, PRNGKeyArray
 from jaxlidar._jax.workers import WorkUnit
 from jaxlidar.planning.setup import Setup
 from jaxlidar.sensors.survey import Survey
-from jaxlidar.survey.results import ShotResults
 
 # Shots of a task: a slice, or their numbers.
 Shots: TypeAlias = slice | Int[np.ndarray, " shots"]
 # The results of one of `shot_slices`, from a function that gives the contribution of a task.
-ContributionSum: TypeAlias = Callable[[Callable[[int], Any], slice], ShotResults]
+ContributionSum: TypeAlias = Callable[[Callable[[int], Any], slice], dict[str, Any]]
 
 
 @dataclasses.dataclass(frozen=True)
