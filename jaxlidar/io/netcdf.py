@@ -254,23 +254,25 @@ def rerun(path: str | os.PathLike[str], progress: Callable[[Any], None] | None =
     return case.simulate(progress)
 
 
+# Units and long names of the arrays of a `Waveform`.
+WAVEFORM_QUANTITIES = {
+    "time": ("ns", "time of arrival relative to the two-way travel time of the reference plane"),
+    "height": ("m", "height above the reference plane from which light of order one arrives"),
+    "reflectance": ("1", "apparent reflectance per sample"),
+    "energy": ("J", "energy that the detector registers per sample"),
+    "stderr": ("1", "standard error of the apparent reflectance"),
+    "components": ("1", "apparent reflectance per sample by material and by order of scattering"),
+    "neglected": ("1", "apparent reflectance that orders beyond the last could add"),
+    "energy_budget": ("1", "share of the emitted energy by fate, before the atmosphere"),
+    "energy_budget_stderr": ("1", "standard error of the share of the emitted energy"),
+    "lost": ("1", "apparent reflectance that arrives before or after all fine bins of the plan"),
+    "recorded": ("J", "energy that the receiver records per sample, without noise"),
+    "wavelength": ("nm", "wavelength of the lidar"),
+}
 keep_as_netcdf(
     Waveform,
     "simulated lidar waveform",
-    {
-        "time": ("ns", "time of arrival relative to the two-way travel time of the reference plane"),
-        "height": ("m", "height above the reference plane from which light of order one arrives"),
-        "reflectance": ("1", "apparent reflectance per sample"),
-        "energy": ("J", "energy that the detector registers per sample"),
-        "stderr": ("1", "standard error of the apparent reflectance"),
-        "components": ("1", "apparent reflectance per sample by material and by order of scattering"),
-        "neglected": ("1", "apparent reflectance that orders beyond the last could add"),
-        "energy_budget": ("1", "share of the emitted energy by fate, before the atmosphere"),
-        "energy_budget_stderr": ("1", "standard error of the share of the emitted energy"),
-        "lost": ("1", "apparent reflectance that arrives before or after all fine bins of the plan"),
-        "recorded": ("J", "energy that the receiver records per sample, without noise"),
-        "wavelength": ("nm", "wavelength of the lidar"),
-    },
+    WAVEFORM_QUANTITIES,
     dimensions={"scenes": "scene", "samples": "time", "wavelengths": "wavelength"},
     items={"components": "component", "energy_budget": "fate", "energy_budget_stderr": "fate"},
     coordinates={"height": "time"},

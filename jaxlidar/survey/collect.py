@@ -14,6 +14,7 @@ import jax
 import numpy as np
 
 from jaxlidar._fields.checks import warn_user
+from jaxlidar._not_kept import NotKept
 from jaxlidar._summary import NOTABLE_FRACTION, percent, unfollowed_message
 from jaxlidar.io.case import Case
 from jaxlidar.io.datasets import datasets_of
@@ -24,18 +25,13 @@ from jaxlidar.simulation.one_scene import LateLightWarning, UnfollowedLightWarni
 from jaxlidar.spectral.apply_optics import make_waveform_model, refuse_excess
 from jaxlidar.spectral.truth_class import Truth
 from jaxlidar.survey.acquisition import Acquisition
-from jaxlidar.survey.results import ShotResults
+from jaxlidar.survey.results import EXCESS, MISSING_LIGHT, OPTIONAL_ARRAYS
 from jaxlidar.survey.shared_illumination import GroupContribution
 from jaxlidar.survey.strategy import AbstractStrategy, Shots
 from jaxlidar.survey.waveforms import Waveforms
 
 # The group of a store that has contributions until they are summed, and its number of rows of a chunk.
 _CONTRIBUTIONS, _CONTRIBUTIONS_PER_CHUNK = "contributions", 64
-# Quantities of `ShotResults` that `Waveforms` do not have, for the warnings of a run that goes on.
-_MISSING_LIGHT = {
-    "late": "fraction of the emitted light that returns after the end of the record",
-    "unfollowed": "fraction of the waveform that orders beyond the last may add",
-}
 
 
 class ShotsInMemory:
@@ -151,10 +147,10 @@ def waveforms_in_memory(
     """
     assert isinstance(results.light, ShotsInMemory)
     assert isinstance(results.truth, ShotsInMemory)
-    light: ShotResults = results.light.values
-    refuse_excess(light.excess)
-    _warn_of_missing_light(results.strategy, light.late, light.unfollowed)
-    fields = {**survey_fields, **light.waveform_fields()}
+    light = results.light.values
+    refuse_excess(light[EXCESS])
+    _warn_of_missing_light(results.strategy, *(light[name] for name in MISSING_LIGHT))
+    fields = {**survey_fields, **_fields_of(light)}
     if results.truth.values is not None:
         fields["truth"] = _truth(results.strategy, results.truth.values)
     return _waveforms(results.strategy, fields, _info(results.strategy, start_time) | info)
@@ -190,14 +186,14 @@ class StoredSurvey:
             light.is_done[:chunk] = truth.is_done[:chunk] = False
         self.results = SurveyResults(strategy, light, truth, contributions)
 
-    def _write_light(self, shots: Shots, results: ShotResults) -> None:
-        refuse_excess(results.excess)
+    def _write_light(self, shots: Shots, results: dict[str, Any]) -> None:
+        refuse_excess(results[EXCESS])
         fields = {
             # An acquisition is a group of its own, which is written once for all shots.
             name: value if isinstance(value, Acquisition) else value[shots]
             for name, value in self._survey_fields.items()
         }
-        waveforms = _waveforms(self._strategy, {**fields, **results.waveform_fields()}, {})
+        waveforms = _waveforms(self._strategy, {**fields, **_fields_of(results)}, {})
         if self._light.has_layout:
             datasets = datasets_of(waveforms)
         else:
@@ -205,8 +201,8 @@ class StoredSurvey:
             for path in datasets.keys() - {"/"}:
                 write_zarr_group(self._store.path, path, datasets[path])
         missing_light = {
-            name: ("shot", getattr(results, name), {"units": "1", "long_name": long_name})
-            for name, long_name in _MISSING_LIGHT.items()
+            name: ("shot", results[name], {"units": "1", "long_name": long_name})
+            for name, long_name in MISSING_LIGHT.items()
         }
         dataset = datasets["/"].assign(missing_light)
         # `finish` writes `info`. A truth, which is another task's, is a group and no attribute.
@@ -224,7 +220,7 @@ class StoredSurvey:
             del root[_CONTRIBUTIONS]
         # A store that was finished before stays as it is, but for chunks that were damaged.
         if "info" not in root.attrs:
-            _warn_of_missing_light(self._strategy, *(root[name][:] for name in _MISSING_LIGHT))
+            _warn_of_missing_light(self._strategy, *(root[name][:] for name in MISSING_LIGHT))
             root.attrs["info"] = json.dumps(_info(self._strategy, start_time) | info, default=float)
         consolidate(self._store.path)
 
@@ -247,6 +243,12 @@ def _truth(strategy: AbstractStrategy, fields: dict[str, Any]) -> Truth:
     return Truth(time=time, **fields)
 
 
+def _fields_of(light: dict[str, Any]) -> dict[str, Any]:
+    """Return the fields of `Waveforms` among results; arrays that are not kept are `NotKept`."""
+    not_kept = {name: NotKept(name) for name in OPTIONAL_ARRAYS if name not in light}
+    return not_kept | {name: a for name, a in light.items() if name not in (*MISSING_LIGHT, EXCESS)}
+
+
 def _waveforms(strategy: AbstractStrategy, fields: dict[str, Any], info: dict[str, Any]) -> Waveforms:
     return Waveforms(
         time=np.asarray(make_waveform_model(strategy.setup).time),
@@ -259,7 +261,7 @@ def _waveforms(strategy: AbstractStrategy, fields: dict[str, Any], info: dict[st
 def _warn_of_missing_light(strategy: AbstractStrategy, late: np.ndarray, unfollowed: np.ndarray) -> None:
     """Warn if much light of a shot is after the record, or may be in orders that were not followed.
 
-    `late`, `unfollowed`: (shots,) as in `ShotResults`.
+    `late`, `unfollowed`: (shots,), those of `MISSING_LIGHT`.
     """
     plan = strategy.setup.plan
     most_late, most_unfollowed = (float(np.max(a, initial=0.0)) for a in (late, unfollowed))

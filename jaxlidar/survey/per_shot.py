@@ -58,7 +58,7 @@ from jaxlidar.spectral.apply_optics import (
     relative_energy_samples,
     total_samples,
 )
-from jaxlidar.survey.results import SAMPLED_ARRAYS, ShotErrors, ShotResults, make_shot_results
+from jaxlidar.survey.results import SAMPLED_ARRAYS, ShotErrors, make_shot_results
 from jaxlidar.survey.strategy import AbstractStrategy, Shots, slices_of_shots, without_padding
 from jaxlidar.trace.device_scene import DeviceScene, aim_at, build_device_scene
 from jaxlidar.trace.first.first_order import FirstOrderTally
@@ -244,7 +244,7 @@ class PerShotStrategy(AbstractStrategy):
     def shots_of_task(self, number: int) -> Shots:
         return self.shot_slices[number]
 
-    def results_of_task(self, number: int, result: Any) -> ShotResults:
+    def results_of_task(self, number: int, result: Any) -> dict[str, Any]:
         return result
 
     def info(self) -> dict[str, Any]:
@@ -258,7 +258,7 @@ def trace_chunk(
     kept_names: tuple[str, ...],
     resolves_edges: bool,
     key: PRNGKeyArray,
-) -> ShotResults:
+) -> dict[str, Any]:
     """Trace a chunk of shots."""
     n_shots = len(shots.number)
     results = compiled_shots(
@@ -272,8 +272,7 @@ def trace_chunk(
         kept_names,
         resolves_edges,
     )
-    fields = without_padding(results._asdict(), n_shots, context.n_samples, SAMPLED_ARRAYS)
-    return ShotResults(**fields)
+    return without_padding(results, n_shots, context.n_samples, SAMPLED_ARRAYS)
 
 
 class ShotBatch(NamedTuple):
@@ -316,7 +315,7 @@ def aim_shot(
     return AimedShot(aimed_scene, aimed_model, jax.random.fold_in(key, shot.number))
 
 
-def _trace_shot(aimed: AimedShot, rtol: Array, kept_names: tuple[str, ...]) -> ShotResults:
+def _trace_shot(aimed: AimedShot, rtol: Array, kept_names: tuple[str, ...]) -> dict[str, Any]:
     """Trace one shot until its tolerance is met.
 
     Where nothing is random, that is one batch, whose errors are zero. Otherwise the estimate is refined, by
@@ -336,7 +335,7 @@ def _trace_shot(aimed: AimedShot, rtol: Array, kept_names: tuple[str, ...]) -> S
 
 def _shot_results(
     aimed: AimedShot, estimate: RunningMoments, kept_names: tuple[str, ...], error_factor: float = 1.0
-) -> ShotResults:
+) -> dict[str, Any]:
     """Return the results of a shot from the moments of its batches.
 
     `error_factor`: standard error over that of batches that are independent.
@@ -458,7 +457,7 @@ def _trace_narrow_shots(
     rtol: Array,
     kept_names: tuple[str, ...],
     resolves_edges: bool,
-) -> ShotResults:
+) -> dict[str, Any]:
     """Trace the lattices of the first `count` narrow shots, again for those not within the tolerance.
 
     In each round:
@@ -476,24 +475,24 @@ def _trace_narrow_shots(
 
     is_shot = jnp.arange(n_shots) < count
 
-    def is_pending(n_parts: Array, results: ShotResults) -> Array:
-        return is_shot & ((n_parts == 0) | ((results.error > rtol) & (n_parts < max_parts)))
+    def is_pending(n_parts: Array, results: dict[str, Any]) -> Array:
+        return is_shot & ((n_parts == 0) | ((results["error"] > rtol) & (n_parts < max_parts)))
 
-    def trace_some(numbers: Array, n_parts: Array) -> ShotResults:
+    def trace_some(numbers: Array, n_parts: Array) -> dict[str, Any]:
         shots_of_group = jax.tree.map(lambda a: a[numbers], shots)
         return _trace_together(
             scene, model, atmosphere, shots_of_group, n_parts, key, kept_names, error_factor
         )
 
-    def next_round(state: tuple[Array, ShotResults]) -> tuple[Array, ShotResults]:
+    def next_round(state: tuple[Array, dict[str, Any]]) -> tuple[Array, dict[str, Any]]:
         n_parts, results = state
-        following = jnp.minimum(_LATTICE_STEPS.next_size(n_parts, results.error, rtol), max_parts)
+        following = jnp.minimum(_LATTICE_STEPS.next_size(n_parts, results["error"], rtol), max_parts)
         pending = is_pending(*state)
         n_parts = jnp.where(pending, jnp.where(n_parts == 0, first_parts, following), n_parts)
         # Numbers of the shots, those that are pending first.
         order, n_pending = jnp.argsort(~pending, stable=True), jnp.sum(pending, dtype=jnp.int32)
 
-        def trace_group(group: Array, results: ShotResults) -> ShotResults:
+        def trace_group(group: Array, results: dict[str, Any]) -> dict[str, Any]:
             position = group * _SHOTS_AT_ONCE + jnp.arange(_SHOTS_AT_ONCE, dtype=jnp.int32)
             exists = position < n_pending
             numbers = order[jnp.minimum(position, n_shots - 1)]
@@ -520,7 +519,7 @@ def _trace_together(
     key: PRNGKeyArray,
     kept_names: tuple[str, ...],
     error_factor: float,
-) -> ShotResults:
+) -> dict[str, Any]:
     """Trace the lattices of a group of shots, each in `n_parts` parts.
 
     1. List the parts of all lattices of all shots, shot by shot.
@@ -570,7 +569,7 @@ def _trace_together(
     )
 
     # Step 3.
-    def results_of(shot: ShotGeometry, sums: LatticeSums) -> ShotResults:
+    def results_of(shot: ShotGeometry, sums: LatticeSums) -> dict[str, Any]:
         aimed = aim_shot(scene, model, atmosphere, shot, key)
         aimed = aimed._replace(model=aimed.model.for_applied_optics())
         responses = jax.vmap(lambda s: response_of_lattice(scene, s, model.optics))(sums)
@@ -592,14 +591,14 @@ def _trace_shots(
     rtol: Array,
     kept_names: tuple[str, ...],
     resolves_edges: bool,
-) -> ShotResults:
+) -> dict[str, Any]:
     """Trace the first `count` shots over one device scene."""
     if _are_narrow(scene, model):
         return _trace_narrow_shots(
             scene, model, atmosphere, shots, count, key, rtol, kept_names, resolves_edges
         )
 
-    def trace(shot: ShotGeometry) -> ShotResults:
+    def trace(shot: ShotGeometry) -> dict[str, Any]:
         return _trace_shot(aim_shot(scene, model, atmosphere, shot, key), rtol, kept_names)
 
     return map_first_shots(trace, shots, count)

@@ -66,7 +66,7 @@ from jaxlidar.spectral.apply_optics import (
     total_samples,
 )
 from jaxlidar.survey.node_groups import NodeAllocation, NodeGroup
-from jaxlidar.survey.results import ShotErrors, ShotResults, make_shot_results
+from jaxlidar.survey.results import ShotErrors, make_shot_results
 from jaxlidar.survey.strategy import AbstractStrategy, ContributionSum, Shots, slices_of_shots
 from jaxlidar.survey.view_geometry import ViewGeometry
 from jaxlidar.trace.device_scene import DeviceScene, aim_at, build_device_scene
@@ -154,7 +154,7 @@ class SharedIlluminationStrategy(AbstractStrategy):
     def results_of_task(self, number: int, result: Any) -> Any:
         return result
 
-    def _sum_contributions(self, contribution_of: Callable[[int], Any], shots: slice) -> ShotResults:
+    def _sum_contributions(self, contribution_of: Callable[[int], Any], shots: slice) -> dict[str, Any]:
         numbers = [
             number
             for number, group in enumerate(self.groups)
@@ -513,7 +513,7 @@ def sum_contributions(
     contributions: Iterable[GroupContribution],
     shots: slice,
     kept_names: tuple[str, ...],
-) -> ShotResults:
+) -> dict[str, Any]:
     """Return the results of at most `SHOTS_PER_BLOCK` shots, from the contributions of groups.
 
     `kept_names`: as in `make_shot_results`.
@@ -538,13 +538,13 @@ def sum_contributions(
     )
     of_shots, count = jax.tree.map(lambda a: jnp.asarray(a, float), of_shots), shots.stop - shots.start
     padded = _compiled_complete(context.model, context.air, of_shots, kept_names)
-    results: ShotResults = jax.tree.map(lambda a: np.asarray(a)[:count], padded)
-    return results._replace(photons=sums["photons"][:count].astype(int))
+    results: dict[str, Any] = jax.tree.map(lambda a: np.asarray(a)[:count], padded)
+    return results | {"photons": sums["photons"][:count].astype(int)}
 
 
 def _complete_shot(
     model: WaveformModel, air: AirReturn | None, sums: ShotSums, kept_names: tuple[str, ...]
-) -> ShotResults:
+) -> dict[str, Any]:
     """Return the results of one shot."""
     # The last components are the first order and the relative energy, which are no further light.
     by_component, reflectance = (
@@ -568,7 +568,7 @@ def _complete_shot(
 
 def _complete_shots(
     model: WaveformModel, air: AirReturn | None, sums: ShotSums, kept_names: tuple[str, ...]
-) -> ShotResults:
+) -> dict[str, Any]:
     return jax.vmap(lambda shot: _complete_shot(model, air, shot, kept_names))(sums)
 
 

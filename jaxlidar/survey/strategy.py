@@ -12,12 +12,11 @@ from jaxtyping import Int, PRNGKeyArray
 from jaxlidar._jax.workers import WorkUnit
 from jaxlidar.planning.setup import Setup
 from jaxlidar.sensors.survey import Survey
-from jaxlidar.survey.results import ShotResults
 
 # Shots of a task: a slice, or their numbers.
 Shots: TypeAlias = slice | Int[np.ndarray, " shots"]
 # The results of one of `shot_slices`, from a function that gives the contribution of a task.
-ContributionSum: TypeAlias = Callable[[Callable[[int], Any], slice], ShotResults]
+ContributionSum: TypeAlias = Callable[[Callable[[int], Any], slice], dict[str, Any]]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -94,5 +93,5 @@ def without_padding(
     last axis is samples.
     """
     rows = jax.tree.map(lambda a: np.asarray(a)[:n_shots], dict(fields))
-    sampled = {name: rows[name] for name in sampled_names}
+    sampled = {name: rows[name] for name in sampled_names if name in rows}
     return rows | jax.tree.map(lambda a: a[..., :n_samples], sampled)

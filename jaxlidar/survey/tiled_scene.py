@@ -33,7 +33,6 @@ from jaxlidar.sensors.survey import Survey
 from jaxlidar.survey.choose_strategy import choose_strategy
 from jaxlidar.survey.collect import ShotsInMemory, SurveyResults
 from jaxlidar.survey.coverage import ground_heights, off_map
-from jaxlidar.survey.results import ShotResults
 from jaxlidar.survey.strategy import AbstractStrategy, Shots, slices_of_shots
 from jaxlidar.survey.truths import StrategyWithTruth
 
@@ -247,23 +246,14 @@ class TiledSceneStrategy(AbstractStrategy):
         """Return the results of a tile, with zeros for the materials that its part of the scene lacks."""
         if number >= self.n_light_tasks:
             return self._truths_of_tile(result)
-        results: ShotResults = result
-        energy_budget, energy_budget_stderr = (
-            None
-            if a is None
-            else _in_order_of_names(
-                a, [f"absorbed by {m}" for m in self.materials], np.zeros_like(a["escaped"])
-            )
-            for a in (results.energy_budget, results.energy_budget_stderr)
-        )
-        components = results.components
-        if components is not None:
-            components = _in_order_of_names(components, self.materials, np.zeros_like(components["first"]))
-        return results._replace(
-            components=components,
-            energy_budget=energy_budget,
-            energy_budget_stderr=energy_budget_stderr,
-        )
+        results: dict[str, Any] = dict(result)
+        fates = [f"absorbed by {material}" for material in self.materials]
+        names = {"components": self.materials, "energy_budget": fates, "energy_budget_stderr": fates}
+        for field in names.keys() & results.keys():
+            arrays = results[field]
+            no_light = np.zeros_like(next(iter(arrays.values())))
+            results[field] = _in_order_of_names(arrays, names[field], no_light)
+        return results
 
     def _truths_of_tile(self, truths: dict[str, Any]) -> dict[str, Any]:
         no_height = np.full(len(truths["top_height"]), np.nan)
@@ -329,7 +319,7 @@ def trace_tile(
     number: int,
     options: TileOptions,
     key: PRNGKeyArray,
-) -> ShotResults:
+) -> dict[str, Any]:
     """Trace the shots of a tile."""
     # With the window and the orders of all tiles the strategy comes out as in `TiledSceneStrategy.of`.
     strategy = _strategy_of_tile(survey, scene, tile, options)

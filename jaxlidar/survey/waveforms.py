@@ -19,6 +19,7 @@ from jaxlidar.io import netcdf
 from jaxlidar.io.case import Case
 from jaxlidar.io.datasets import datasets_of, keep_as_netcdf
 from jaxlidar.io.las_waveforms import write_las_waveforms
+from jaxlidar.io.netcdf import WAVEFORM_QUANTITIES
 from jaxlidar.sampling.adaptive import StopReason
 from jaxlidar.sensors.lidar import Lidar
 from jaxlidar.sensors.survey import beam_directions
@@ -172,23 +173,17 @@ class Waveforms(eqx.Module):
     def __getitem__(self, shot: int) -> Waveform:
         i = check_index("shot", shot, len(self))
 
-        def row(arrays: dict) -> dict:
-            return {name: jnp.asarray(a[i]) for name, a in arrays.items()}
+        def row(name: str) -> Any:
+            rows = getattr(self, name)
+            if isinstance(rows, dict):
+                return {item: jnp.asarray(a[i]) for item, a in rows.items()}
+            return jnp.asarray(rows[i])
 
-        axes = jnp.asarray(self.time), jnp.asarray(self.height_of_shot(i), self.time.dtype)
         return Waveform(
-            time=axes[0],
-            height=axes[1],
-            reflectance=jnp.asarray(self.reflectance[i]),
-            energy=jnp.asarray(self.energy[i]),
-            stderr=jnp.asarray(self.stderr[i]),
-            components=row(self.components),
-            neglected=jnp.asarray(self.neglected[i]),
-            energy_budget=row(self.energy_budget),
-            energy_budget_stderr=row(self.energy_budget_stderr),
-            lost=jnp.asarray(self.lost[i]),
-            recorded=jnp.asarray(self.recorded[i]),
+            time=jnp.asarray(self.time),
+            height=jnp.asarray(self.height_of_shot(i), self.time.dtype),
             wavelength=jnp.asarray(self.wavelength),
+            **{name: row(name) for name in (*OPTIONAL_ARRAYS, "neglected", "lost")},
             info=self._info(i),
             truth=None if self.truth is None else self.truth[i],
         )
@@ -446,17 +441,8 @@ keep_as_netcdf(
     Waveforms,
     "simulated lidar waveforms of a survey",
     {
+        **{name: quantity for name, quantity in WAVEFORM_QUANTITIES.items() if name != "height"},
         "time": ("ns", "time of arrival relative to the two-way travel time of the aim point"),
-        "wavelength": ("nm", "wavelength of the lidar"),
-        "reflectance": ("1", "apparent reflectance per sample"),
-        "stderr": ("1", "standard error of the apparent reflectance"),
-        "energy": ("J", "energy that the detector registers per sample"),
-        "recorded": ("J", "energy that the receiver records per sample, without noise"),
-        "components": ("1", "apparent reflectance per sample by material and by order of scattering"),
-        "neglected": ("1", "apparent reflectance that orders beyond the last could add"),
-        "lost": ("1", "apparent reflectance that arrives before or after all fine bins of the plan"),
-        "energy_budget": ("1", "fraction of the emitted energy by fate, before the atmosphere"),
-        "energy_budget_stderr": ("1", "standard error of the fraction of the emitted energy"),
         "position": ("m", "x and y where the beam axis meets the reference plane, or x, y, z of the sensor"),
         "zenith": ("degree", "angle between the beam and the vertical"),
         "azimuth": ("degree", "direction in which the beam travels, clockwise from north"),

@@ -107,9 +107,9 @@ def test_standard_errors_of_the_energy_budget_are_those_of_its_sums():
         "after the window": 0.03,
         "unfollowed": 0.04,
     }
-    assert results.energy_budget_stderr.keys() == expected.keys()
+    assert results["energy_budget_stderr"].keys() == expected.keys()
     for name, value in expected.items():
-        np.testing.assert_allclose(results.energy_budget_stderr[name], [[value]], rtol=1e-5, err_msg=name)
+        np.testing.assert_allclose(results["energy_budget_stderr"][name], [[value]], rtol=1e-5, err_msg=name)
 
 
 def test_splines_fit_footprints():
