@@ -57,7 +57,8 @@ class GroundAndCanopy(NamedTuple):
     **Example:** plant area of two records.
 
     >>> import inversion, numpy as np
-    >>> split = inversion.GroundAndCanopy(*np.array([[2.0, 3.0], [50.0, 80.0], [25.0, 0.0], [0.75, 0.5]]))
+    >>> from inversion.metrics.cover import GroundAndCanopy
+    >>> split = GroundAndCanopy(*np.array([[2.0, 3.0], [50.0, 80.0], [25.0, 0.0], [0.75, 0.5]]))
     >>> np.round(inversion.plant_area_index(split.gap), 2)
     Array([0.58, 1.39], dtype=float32)
     """

@@ -73,7 +73,8 @@ class SignalEnds(NamedTuple):
 
     >>> import inversion, numpy as np
     >>> height = np.arange(20.0, -5.0, -0.5)
-    >>> ends = inversion.SignalEnds(top=10.0, bottom=0.0)
+    >>> from inversion.metrics.heights import SignalEnds
+    >>> ends = SignalEnds(top=10.0, bottom=0.0)
     >>> print(inversion.relative_heights(height, np.ones(height.size), levels=(50.0,), ends=ends))
     [5.]
     """

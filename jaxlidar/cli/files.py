@@ -11,7 +11,6 @@ import numpy as np
 from jaxlidar.cli.shared import ResultPath
 from jaxlidar.io import (
     AirborneShot,
-    AirborneShots,
     Case,
     atomic_write,
     read_case,
@@ -26,6 +25,7 @@ from jaxlidar.io import (
     write_case,
     write_las_waveforms,
 )
+from jaxlidar.io.airborne import AirborneShots
 from jaxlidar.io.dem import read_grid
 from jaxlidar.io.las import read_stored_points
 from jaxlidar.io.las_header import read_header

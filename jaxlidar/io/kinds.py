@@ -31,7 +31,7 @@ from jaxlidar.plants.meshes import Mesh, mesh_of, voxelise_mesh
 from jaxlidar.plants.point_canopy import PointCanopy, canopy_from_points
 from jaxlidar.plants.point_cloud import PointCloud
 from jaxlidar.plants.stand import Stand
-from jaxlidar.plants.voxelise import trim_empty_layers, voxelise, voxelise_points
+from jaxlidar.plants.voxelise import voxelise, voxelise_points
 from jaxlidar.scenes.mesh_surface import MeshInstances, MeshSurface
 from jaxlidar.scenes.surfaces import AbstractGround, AbstractSheet, Ground, Plate
 from jaxlidar.scenes.voxels import VoxelMap
@@ -50,7 +50,7 @@ _NO_KINDS = ("PhotonEvents",)
 _FUNCTIONS: tuple[Callable[..., Any], ...] = (
     *(Branching, Habit, broadleaf, conifer, shrub, spreading_tree, grow, forest),
     *(stand_of_leaf_area, stand_from_inventory, read_inventory, Stand, Stand.above, Stand.joined),
-    *(voxelise, voxelise_mesh, trim_empty_layers, Mesh, mesh_of, VoxelMap.above),
+    *(voxelise, voxelise_mesh, VoxelMap.trimmed, Mesh, mesh_of, VoxelMap.above),
     *(canopy_from_points, voxelise_points, read_las, read_qsm),
     *(VoxelMap.from_lad, VoxelMap.from_extinction, VoxelMap.from_probability),
     *(Survey.grid, Survey.track, Survey.scan, Survey.fly, read_trajectory, instrument),
@@ -58,7 +58,11 @@ _FUNCTIONS: tuple[Callable[..., Any], ...] = (
     *(spectrum, read_spectrum_csv, read_vox, read_dem, read_obj, load_coefficients, Coefficients),
 )
 # Methods among them, with the class of their object and the name of the argument that it is.
-_METHODS = {Stand.above: (Stand, "stand"), VoxelMap.above: (VoxelMap, "voxels")}
+_METHODS = {
+    Stand.above: (Stand, "stand"),
+    VoxelMap.above: (VoxelMap, "voxels"),
+    VoxelMap.trimmed: (VoxelMap, "voxels"),
+}
 # The class of a table without `kind`, by the abstract class that is admissible.
 _DEFAULT_CLASSES = {AbstractGround: Ground, AbstractSheet: Plate}
 # The class of such a table where several are admissible.

@@ -55,7 +55,7 @@ from jaxlidar._fields.checks import (
     check_range,
 )
 from jaxlidar._not_kept import NotKept
-from jaxlidar._progress import TaskProgress
+from jaxlidar._progress import Progress
 from jaxlidar._registry import decompose_records
 from jaxlidar.io.airborne import AirborneShot, Returns, Segment
 from jaxlidar.io.las import write_las
@@ -790,7 +790,7 @@ def returns_of(
     threshold: Any = None,
     fraction: Any = 0.5,
     max_returns: int | None = None,
-    progress: Callable[[TaskProgress], None] | None = None,
+    progress: Callable[[Progress], None] | None = None,
 ) -> DiscreteReturns:
     """Detect the returns of waveforms. Arguments are those of `Waveforms.returns`."""
     if not callable(detector):
@@ -818,7 +818,7 @@ def returns_of(
         else:
             blocks.append(_detect_chunk(waves, records[shots], shots, settings, is_own_record))
         if progress is not None:
-            progress(TaskProgress(shots.stop, len(waves), time.perf_counter() - start_time))
+            progress(Progress(shots.stop, len(waves), time.perf_counter() - start_time))
     echoes = {name: np.concatenate([block[name] for block in blocks]) for name in blocks[0]}
     return _assemble(waves, echoes, max_returns)
 

@@ -13,7 +13,7 @@ from jaxtyping import ArrayLike, Float, Int
 from jaxlidar._constants import SPEED_OF_LIGHT
 from jaxlidar._fields.checks import check_numbers
 from jaxlidar._not_kept import NotKept
-from jaxlidar._progress import TaskProgress
+from jaxlidar._progress import Progress
 from jaxlidar._registry import detect_returns, true_returns
 from jaxlidar._summary import NOTABLE_FRACTION, percent
 from jaxlidar.io import netcdf
@@ -227,7 +227,7 @@ class Waveforms(eqx.Module):
         threshold: ArrayLike | None = None,
         fraction: ArrayLike = 0.5,
         max_returns: int | None = None,
-        progress: Callable[[TaskProgress], None] | None = None,
+        progress: Callable[[Progress], None] | None = None,
     ) -> DiscreteReturns:
         """Detect the discrete returns of all shots, as a laser scanner reports them.
 
@@ -258,7 +258,7 @@ class Waveforms(eqx.Module):
         - `fraction`: level of "constant fraction" on the leading edge, over the amplitude, in (0, 1).
           Default 0.5.
         - `max_returns`: of a shot with more, the strongest so many are returned. Default None: all.
-        - `progress`: a function called with a `TaskProgress` after every few thousand shots. Default None.
+        - `progress`: a function called with a `Progress` after every few thousand shots. Default None.
 
         **Returns:** a `DiscreteReturns`.
 
