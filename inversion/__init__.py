@@ -71,7 +71,6 @@ from inversion.metrics.cover import (
     plant_area_index,
     plant_area_profile,
 )
-from inversion.metrics.decomposition import gaussian_decomposition
 from inversion.metrics.deconvolution import richardson_lucy, wiener
 from inversion.metrics.gedi import gedi_metrics, gedi_settings
 from inversion.metrics.gedi_table import gedi_table
@@ -85,6 +84,7 @@ from inversion.receiver.shot_response import shot_response
 from inversion.scene.clumps import clumped_leaves
 from inversion.scene.geolocation import geolocate
 from inversion.scene.retrieval import retrieve_scene
+from jaxlidar.survey.decomposition import gaussian_decomposition
 
 __all__ = [
     # Fits with a model.

@@ -20,7 +20,6 @@ For laws, pulses and surfaces of your own, and for packages on top such as `inve
   GPUs round their factors.
 - `side_by_side` runs compiled programs on as many threads as there are cores; compile them with `ONE_CORE`.
 - `outcomes` runs the tasks that `task` makes, in this process or by the workers of an executor.
-- `decompose_records.register` makes a function the decomposition of `Waveforms.returns`; `inversion` does.
 """
 
 from jaxlidar._fields.checks import (
@@ -43,7 +42,6 @@ from jaxlidar._jax.one_function import once
 from jaxlidar._jax.products import einsum, matmul, tensordot
 from jaxlidar._jax.threads import ONE_CORE, side_by_side
 from jaxlidar._jax.workers import outcomes, task
-from jaxlidar._registry import decompose_records
 from jaxlidar._vectors import (
     Scalar,
     Vec,
@@ -79,7 +77,6 @@ __all__ = [
     "check_range",
     "check_ranges",
     "concrete",
-    "decompose_records",
     "dot",
     "einsum",
     "even_step",

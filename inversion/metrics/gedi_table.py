@@ -49,7 +49,6 @@ from inversion.metrics.gedi import (
 )
 from inversion.metrics.gedi_fit import CANOPY, ESTIMATES, LAYER_ESTIMATES, fit_gedi_shots
 from inversion.metrics.heights import find_ground, signal_ends
-from inversion.metrics.records import size_bucket
 from inversion.scene.layered_canopy import LAYERS, REFLECTANCE_RATIO
 from jaxlidar import Progress
 from jaxlidar.extend import (
@@ -64,6 +63,7 @@ from jaxlidar.io import Column, GediShot, ShotTable
 from jaxlidar.io.gedi import IncompleteShot, read_gedi_rows
 from jaxlidar.io.store import check_store_path
 from jaxlidar.io.tables import ColumnAxis
+from jaxlidar.survey.records import size_bucket
 
 # Setting groups of the product, and shots that are computed at once.
 _GROUPS, _BATCH = range(1, 7), 64

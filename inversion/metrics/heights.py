@@ -38,16 +38,14 @@ from jaxtyping import Array, ArrayLike, Float
 from inversion.metrics.records import (
     NORMAL_MEDIAN,
     PaddedRecord,
-    Pulse,
     check_background,
-    over_shots,
     pad_record,
     sample_pulse_at_heights,
-    size_bucket,
     smooth_pulse,
     vertex_offset,
 )
 from jaxlidar.extend import as_array, check_range
+from jaxlidar.survey.records import Pulse, over_shots, size_bucket
 
 # Sigma clipping: largest noise in standard deviations, and number of iterations.
 _CLIP, _CLIP_ITERATIONS = 3.0, 5

@@ -10,8 +10,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from inversion.metrics.decomposition import Echoes
 from jaxlidar.io import AirborneShot
+from jaxlidar.survey.decomposition import Echoes
 
 
 class EchoPoints(NamedTuple):

@@ -238,7 +238,7 @@ class Waveforms(eqx.Module):
         **Arguments:**
 
         - `detector`: "peak", "constant fraction" or "leading edge"; or "decomposition" into echoes of the
-          pulse's shape, which needs `import inversion` and some milliseconds per shot; or a function of one
+          pulse's shape, which takes some milliseconds per shot; or a function of one
           record's times in ns, samples in J without background, and their noise, NumPy arrays of
           (samples,). It gives the times of the returns in ns, (returns,), a sample or more apart. NaN
           stands for no return, so that compiled functions can give as many times for every record. Times
@@ -257,15 +257,14 @@ class Waveforms(eqx.Module):
           and 1 % of the shot's largest sample. A function applies its own: None alone is admissible.
         - `fraction`: level of "constant fraction" on the leading edge, over the amplitude, in (0, 1).
           Default 0.5.
-        - `max_returns`: of a shot with more, the strongest so many are returned. Default None: all.
+        - `max_returns`: the strongest returns of a shot that has more. Default None: all.
         - `progress`: a function called with a `Progress` after every few thousand shots. Default None.
 
         **Returns:** a `DiscreteReturns`.
 
         **Raises:** ValueError for arguments outside their ranges or of other shapes, for waveforms of a
         file of an earlier version, and for times that a function gives outside of the record or in another
-          shape; TypeError for a detector that is neither a name nor a function; RuntimeError for
-          "decomposition" where `inversion` is not imported.
+          shape; TypeError for a detector that is neither a name nor a function.
 
         **Example:**
 
