@@ -19,7 +19,7 @@ quick_compilation.set_flags()
 jax.config.update("jax_numpy_rank_promotion", "raise")
 
 # Called a million times by the tests of trees alone, and they raise errors of their own.
-UNHOOKED = {"jaxlidar._fields.checks"}
+UNHOOKED = {"jaxlidar._fields"}
 
 
 def hooked_modules():

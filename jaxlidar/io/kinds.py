@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import numpy as np
 
-from jaxlidar._fields.checks import check_kind, concrete_array
+from jaxlidar._fields.checks import MAGNITUDES, check_kind, concrete_array
 from jaxlidar._registry import public_objects
 from jaxlidar.io.dem import DemRead, read_dem
 from jaxlidar.io.inventory import read_inventory
@@ -79,12 +79,10 @@ ALTERNATIVE_ARGUMENTS = {(Lidar, "sensor")}
 DEGREES = "degrees"
 COMPASS = "degrees clockwise from north"
 UNITS = {
-    "aerosol_scale_height": "m",
+    **{name: magnitude.unit for name, magnitude in MAGNITUDES.items()},
     "alpha": DEGREES,
-    "altitude": "m",
     "angle": DEGREES,
     "angle_spread": DEGREES,
-    "aperture": "m",
     "area": "m",
     "aspect": COMPASS,
     "azimuth": COMPASS,
@@ -95,32 +93,16 @@ UNITS = {
     "bend": DEGREES,
     "bin_width": "ns",
     "bounds": "m",
-    "Cab": "ug/cm2",
-    "Cant": "ug/cm2",
-    "Car": "ug/cm2",
-    "Cc": "g/cm2",
     "clump_diameter": "m",
-    "Cm": "g/cm2",
-    "Cp": "g/cm2",
-    "Cw": "cm",
     "dead_time": "ns",
-    "decay": "ns",
     "detection_threshold": "J per sample",
-    "divergence": "mrad",
     "electronic_noise": "J per sample",
     "end": "m",
-    "energy": "J",
-    "field_of_view": "mrad",
     "frequency": "1/s",
     "gps_time": "s",
-    "fwhm": "ns",
-    "half_angle": DEGREES,
-    "height": "m",
     "heights": "m",
-    "jitter": "ns",
     "leaf_area": "m2",
     "leaf_length": "m",
-    "length": "ns",
     "lidar_ratio": "sr",
     "line_rate": "1/s",
     "max_seconds": "s",
@@ -134,11 +116,8 @@ UNITS = {
     "points": "m",
     "position": "m",
     "pitch": DEGREES,
-    "pulse_rate": "1/s",
-    "rayleigh_scale_height": "m",
     "roll": DEGREES,
     "roughness": "rad",
-    "sampling_interval": "ns",
     "scan_angle": DEGREES,
     "shift": "m",
     "saturation": "J per sample",
@@ -153,10 +132,6 @@ UNITS = {
     "stem_angle": DEGREES,
     "time": "ns",
     "tropism": DEGREES,
-    "trunk_diameter": "m",
-    "visibility": "km",
-    "voxel_size": "m",
-    "wavelength": "nm",
     "window": "ns",
     "yaw": COMPASS,
     "zenith": DEGREES,
