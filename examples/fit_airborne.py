@@ -380,7 +380,7 @@ def fit_shots(
         name = kind.name.replace(" ", "_")
         path = None if stem is None else stem.with_name(f"{stem.name}.{name}.zarr")
         batch = fit(kind, kind_records, echoes, instrument, impulse, path, progress)
-        for i, verdict in enumerate(inversion.judge_fits(batch.fits, about=["ground"])):
+        for i, verdict in enumerate(inversion.judge_fit(batch.fits, about=["ground"])):
             verdict &= record_verdicts[i]
             row, picture = row_of(kind, kind_records[i], echoes[i], batch, i, verdict)
             rows.append(row)

@@ -156,7 +156,7 @@ def row_of(fits, i, closed_forms):
 def compare(rows, answers):
     """Compare fitted rows with the product's values.
 
-    **Returns:** an `inversion.Comparison`, and pairs to draw.
+    **Returns:** what `inversion.compare` returns, and pairs to draw.
     """
     product = {"shot_number": answers["shot"], "rh98": answers["rh"][:, 98]}
     product |= {name: answers[name] for name in ("elev_lowestmode", "pai")}

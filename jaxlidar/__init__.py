@@ -1,7 +1,8 @@
 """A differentiable simulator of full-waveform lidar in JAX.
 
 `simulate` gives the waveform of a `Lidar` over a `Scene`. Readers of files are in `jaxlidar.io`, figures in
-`jaxlidar.plot`, and what extensions build on in `jaxlidar.extend`. Retrieval of scene properties from
+`jaxlidar.plot`, and what extensions build on in `jaxlidar.extend`. Classes of results are documented with
+the functions that return them, in the modules of these. Retrieval of scene properties from
 waveforms is in the package `inversion`.
 
 ## Simulate a waveform
@@ -10,17 +11,17 @@ waveforms is in the package `inversion`.
 
 ## The instrument
 
-`Lidar`, `instrument`, `instruments`, `instrument_sources`, `InstrumentValue`, `AbstractPulse`,
-`GaussianPulse`, `ExponentiallyModifiedGaussianPulse`, `RectangularPulse`, `SampledPulse`.
+`Lidar`, `instrument`, `instruments`, `instrument_sources`, `AbstractPulse`, `GaussianPulse`,
+`ExponentiallyModifiedGaussianPulse`, `RectangularPulse`, `SampledPulse`.
 
 ## Record as a receiver does
 
-`record`, `Receiver`, `first_return_window`, `PhotonCounter`, `PhotonEvents`.
+`record`, `Receiver`, `first_return_window`, `PhotonCounter`.
 
 ## Surveys of many shots
 
 `Survey`, `Trajectory`, `AbstractScan`, `Oscillating`, `RotatingPolygon`, `Conical`, `ground_position`,
-`simulate_many`, `Waveforms`, `TaskProgress`, `SceneParts`, `Acquisition`, `DiscreteReturns`.
+`simulate_many`, `Waveforms`, `SceneParts`, `DiscreteReturns`.
 
 ## Many scenes
 
@@ -29,40 +30,39 @@ waveforms is in the package `inversion`.
 ## Scenes
 
 `Scene`, `Canopy`, `VoxelMap`, `Ground`, `Terrain`, `Plate`, `MeshSurface`, `MeshInstances`, `Atmosphere`,
-`AbstractSurface`, `AbstractGround`, `AbstractSheet`, `AbstractShape`, `Plane`.
+`AbstractGround`, `AbstractSheet`, `AbstractShape`, `Plane`.
 
 ## Leaf optics and spectra
 
-`Prospect`, `LeafOptics`, `prospect_spectra`, `prospect_jacobian`, `plate_model`, `load_coefficients`,
-`Spectrum`, `spectrum`, `spectrum_names`, `read_spectrum_csv`.
+`Prospect`, `LeafOptics`, `plate_model`, `load_coefficients`, `Spectrum`, `spectrum`, `spectrum_names`,
+`read_spectrum_csv`.
 
 ## Reflection, scattering and leaf angles
 
-`AbstractLaw`, `AbstractMirror`, `Lambertian`, `Specular`, `EqualAngle`, `LeafSurface`, `leaf_surface`,
-`LeafAngles`, `AbstractPhase`, `Isotropic`, `HenyeyGreenstein`.
+`AbstractLaw`, `Lambertian`, `Specular`, `EqualAngle`, `leaf_surface`, `LeafAngles`, `AbstractPhase`,
+`Isotropic`, `HenyeyGreenstein`.
 
 ## Plants
 
 `Habit`, `Branching`, `broadleaf`, `conifer`, `shrub`, `spreading_tree`, `grow`, `forest`,
-`stand_of_leaf_area`, `stand_from_inventory`, `Stand`, `Inventory`, `Tree`,
-`LSystem`, `Rule`, `Symbol`, `Word`, `turtle`, `voxelise`, `voxelise_copies`, `voxelise_points`,
-`canopy_from_points`, `PointCanopy`, `voxelise_mesh`, `Mesh`, `mesh_of`, `trim_empty_layers`.
+`stand_of_leaf_area`, `stand_from_inventory`, `Stand`, `Tree`, `LSystem`, `Rule`, `turtle`, `voxelise`,
+`voxelise_points`, `canopy_from_points`, `voxelise_mesh`, `Mesh`, `mesh_of`.
 
 ## Sunlight
 
-`reflectance_factor`, `ReflectanceFactor`, `plan_reflectance`.
+`reflectance_factor`, `plan_reflectance`.
 
 ## Truth and energy
 
-`truth_of`, `Truth`, `energy_budget`, `EnergyBudget`.
+`truth_of`, `energy_budget`.
 
 ## The steps of a simulation
 
-`plan`, `Plan`, `Effect`, `make_setup`, `Setup`, `trace_scene`, `Response`, `waveform_of`.
+`plan`, `Plan`, `make_setup`, `trace_scene`, `waveform_of`.
 
 ## Compiled programs
 
-`compilation_cache`, `CompilationCache`.
+`compilation_cache`.
 
 ## Warnings and constants
 
@@ -81,34 +81,33 @@ from jaxlidar import extend, io
 from jaxlidar._constants import SPEED_OF_LIGHT
 from jaxlidar._fields.checks import UnitWarning
 from jaxlidar._fingerprint import version_of
-from jaxlidar._jax.compilation_cache import CompilationCache, compilation_cache
+from jaxlidar._jax.compilation_cache import compilation_cache
 from jaxlidar._jax.workers import LostWorkersWarning
-from jaxlidar._progress import Progress, TaskProgress
+from jaxlidar._progress import Progress
 from jaxlidar._registry import register_public_objects, waveform_html
 from jaxlidar.io.netcdf import open, rerun
 from jaxlidar.optics.coefficients import load_coefficients
-from jaxlidar.optics.laws import AbstractLaw, AbstractMirror, EqualAngle, Lambertian, Specular
+from jaxlidar.optics.laws import AbstractLaw, EqualAngle, Lambertian, Specular
 from jaxlidar.optics.leaf import LeafOptics
 from jaxlidar.optics.leaf_angles import LeafAngles
-from jaxlidar.optics.leaf_surface import LeafSurface, leaf_surface
+from jaxlidar.optics.leaf_surface import leaf_surface
 from jaxlidar.optics.phase import AbstractPhase, HenyeyGreenstein, Isotropic
 from jaxlidar.optics.plate_model import plate_model
-from jaxlidar.optics.prospect import Prospect, prospect_jacobian, prospect_spectra
+from jaxlidar.optics.prospect import Prospect
 from jaxlidar.optics.spectra import Spectrum, read_spectrum_csv, spectrum, spectrum_names
-from jaxlidar.planning.effects import Effect
 from jaxlidar.planning.plan import Plan, plan
 from jaxlidar.planning.scene_family import plan_scenes
-from jaxlidar.planning.setup import Setup, make_setup
+from jaxlidar.planning.setup import make_setup
 from jaxlidar.plants.forest import forest, stand_of_leaf_area
 from jaxlidar.plants.habits import Branching, Habit, broadleaf, conifer, grow, shrub, spreading_tree
-from jaxlidar.plants.inventory import Inventory, stand_from_inventory
-from jaxlidar.plants.lsystem import LSystem, Rule, Symbol, Word
+from jaxlidar.plants.inventory import stand_from_inventory
+from jaxlidar.plants.lsystem import LSystem, Rule
 from jaxlidar.plants.meshes import Mesh, SolidMeshWarning, mesh_of, voxelise_mesh
-from jaxlidar.plants.point_canopy import PointCanopy, canopy_from_points
+from jaxlidar.plants.point_canopy import canopy_from_points
 from jaxlidar.plants.stand import Stand
 from jaxlidar.plants.tree import Tree
 from jaxlidar.plants.turtle import turtle
-from jaxlidar.plants.voxelise import trim_empty_layers, voxelise, voxelise_copies, voxelise_points
+from jaxlidar.plants.voxelise import voxelise, voxelise_points
 from jaxlidar.scenes.atmosphere import Atmosphere
 from jaxlidar.scenes.canopy import Canopy
 from jaxlidar.scenes.mesh_surface import MeshInstances, MeshSurface
@@ -116,12 +115,12 @@ from jaxlidar.scenes.relative_height import MisplacedCanopyWarning
 from jaxlidar.scenes.scene import Scene
 from jaxlidar.scenes.scene_parts import SceneParts
 from jaxlidar.scenes.shapes import AbstractShape, OutlineWarning, Plane
-from jaxlidar.scenes.surfaces import AbstractGround, AbstractSheet, AbstractSurface, Ground, Plate
+from jaxlidar.scenes.surfaces import AbstractGround, AbstractSheet, Ground, Plate
 from jaxlidar.scenes.terrain import Terrain
 from jaxlidar.scenes.voxels import VoxelMap
-from jaxlidar.sensors.catalogue import InstrumentValue, instrument, instrument_sources, instruments
+from jaxlidar.sensors.catalogue import instrument, instrument_sources, instruments
 from jaxlidar.sensors.lidar import Lidar
-from jaxlidar.sensors.photon_counter import PhotonCounter, PhotonEvents
+from jaxlidar.sensors.photon_counter import PhotonCounter
 from jaxlidar.sensors.pulse import (
     AbstractPulse,
     ExponentiallyModifiedGaussianPulse,
@@ -133,18 +132,17 @@ from jaxlidar.sensors.receiver import Receiver, first_return_window, record
 from jaxlidar.sensors.scan import AbstractScan, Conical, Oscillating, RotatingPolygon
 from jaxlidar.sensors.survey import Survey
 from jaxlidar.sensors.trajectory import Trajectory
-from jaxlidar.simulation.energy import EnergyBudget, energy_budget
+from jaxlidar.simulation.energy import energy_budget
 from jaxlidar.simulation.many_scenes import simulate_scenes
 from jaxlidar.simulation.one_scene import LateLightWarning, UnfollowedLightWarning, simulate
-from jaxlidar.simulation.reflectance import ReflectanceFactor, plan_reflectance, reflectance_factor
-from jaxlidar.simulation.truth import Truth, truth_of
+from jaxlidar.simulation.reflectance import plan_reflectance, reflectance_factor
+from jaxlidar.simulation.truth import truth_of
 from jaxlidar.spectral.waveform import Waveform, total_reflectance, waveform_of
-from jaxlidar.survey.acquisition import Acquisition
 from jaxlidar.survey.coverage import OffMapWarning, ground_position
 from jaxlidar.survey.returns import DiscreteReturns
 from jaxlidar.survey.simulate_many import simulate_many
 from jaxlidar.survey.waveforms import Waveforms
-from jaxlidar.trace.response import Response, trace_scene
+from jaxlidar.trace.response import trace_scene
 
 if TYPE_CHECKING:
     from jaxlidar import plot
@@ -162,7 +160,6 @@ __all__ = [
     "instrument",
     "instruments",
     "instrument_sources",
-    "InstrumentValue",
     "AbstractPulse",
     "GaussianPulse",
     "ExponentiallyModifiedGaussianPulse",
@@ -173,7 +170,6 @@ __all__ = [
     "Receiver",
     "first_return_window",
     "PhotonCounter",
-    "PhotonEvents",
     # Surveys of many shots.
     "Survey",
     "Trajectory",
@@ -184,9 +180,7 @@ __all__ = [
     "ground_position",
     "simulate_many",
     "Waveforms",
-    "TaskProgress",
     "SceneParts",
-    "Acquisition",
     "DiscreteReturns",
     # Many scenes.
     "simulate_scenes",
@@ -201,7 +195,6 @@ __all__ = [
     "MeshSurface",
     "MeshInstances",
     "Atmosphere",
-    "AbstractSurface",
     "AbstractGround",
     "AbstractSheet",
     "AbstractShape",
@@ -209,8 +202,6 @@ __all__ = [
     # Leaf optics and spectra.
     "Prospect",
     "LeafOptics",
-    "prospect_spectra",
-    "prospect_jacobian",
     "plate_model",
     "load_coefficients",
     "Spectrum",
@@ -219,11 +210,9 @@ __all__ = [
     "read_spectrum_csv",
     # Reflection, scattering and leaf angles.
     "AbstractLaw",
-    "AbstractMirror",
     "Lambertian",
     "Specular",
     "EqualAngle",
-    "LeafSurface",
     "leaf_surface",
     "LeafAngles",
     "AbstractPhase",
@@ -241,44 +230,30 @@ __all__ = [
     "stand_of_leaf_area",
     "stand_from_inventory",
     "Stand",
-    "Inventory",
     "Tree",
     "LSystem",
     "Rule",
-    "Symbol",
-    "Word",
     "turtle",
     "voxelise",
-    "voxelise_copies",
     "voxelise_points",
     "canopy_from_points",
-    "PointCanopy",
     "voxelise_mesh",
     "Mesh",
     "mesh_of",
-    "trim_empty_layers",
     # Sunlight.
     "reflectance_factor",
-    "ReflectanceFactor",
     "plan_reflectance",
     # Truth and energy.
     "truth_of",
-    "Truth",
     "energy_budget",
-    "EnergyBudget",
     # The steps of a simulation.
     "plan",
     "Plan",
-    "Effect",
     "make_setup",
-    "Setup",
     "trace_scene",
-    "Response",
     "waveform_of",
     # Compiled programs.
     "compilation_cache",
-    "CompilationCache",
-    # Paths as the paper traces them.
     # Warnings and constants.
     "LateLightWarning",
     "UnfollowedLightWarning",

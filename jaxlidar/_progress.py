@@ -1,4 +1,4 @@
-"""Progress, as it is reported to the argument `progress`: of a simulation, and of work that is counted."""
+"""Progress, as it is reported to the argument `progress` of all functions that take long."""
 
 import dataclasses
 import math
@@ -6,62 +6,37 @@ import math
 
 @dataclasses.dataclass(frozen=True)
 class Progress:
-    """Progress of a simulation: `simulate` and `energy_budget` call their argument `progress` with it.
-
-    Printed, it is one line of text.
-
-    - `batches`: number of batches traced until now.
-    - `photons`: number of photons traced until now.
-    - `seconds`: time elapsed.
-    - `error`: current relative error: of the waveform, as `simulate` defines it, or of the emitted energy.
-    - `rtol`: target of the relative error, or None where the number of photons is given.
-
-    **Example:**
-
-    >>> import jaxlidar as jl
-    >>> print(jl.Progress(batches=8, photons=65536, seconds=1.5, error=0.004, rtol=0.01))
-    8 batches, 65536 photons, 1.5 s, relative error 0.004 (aim 0.01)
-    """
-
-    batches: int
-    photons: int
-    seconds: float
-    error: float
-    rtol: float | None
-
-    def __str__(self) -> str:
-        target = "" if self.rtol is None else f" (aim {self.rtol:.2g})"
-        return (
-            f"{self.batches} batches, {self.photons} photons, {self.seconds:.1f} s, "
-            f"relative error {self.error:.2g}{target}"
-        )
-
-
-@dataclasses.dataclass(frozen=True)
-class TaskProgress:
-    """Progress of work that is counted, such as the shots of `simulate_many`. Printed, it is one line.
+    """Progress of a simulation, a survey, many fits or a table. Printed, it is one line of text.
 
     - `done`: number that is done, that of an earlier run included. With shared illumination, and with truth,
       shots count in proportion to the tasks that are done.
-    - `total`: number in all.
+    - `total`: number in all; None where it depends on the error.
     - `seconds`: time since the work began, s; planning comes before.
-    - `unit`: what is counted, such as "shots" or "fits". Default "shots".
+    - `unit`: what is counted: "shots" of a survey or table, "fits", or the "photons" of `simulate` and
+      `energy_budget`. Default "shots".
     - `stored`: number that an earlier run has done, which took none of these seconds. Default 0.
     - `converged`: number of fits that have converged; None where there are none. Default None.
+    - `error`: current relative error: of the waveform, as `simulate` defines it, or of the emitted energy;
+      None where none is estimated. Default None.
+    - `rtol`: target of the relative error, or None where there is none. Default None.
 
-    **Example:**
+    **Example:** of a survey, and of a simulation.
 
     >>> import jaxlidar as jl
-    >>> print(jl.TaskProgress(done=500, total=2000, seconds=10.0))
+    >>> print(jl.Progress(done=500, total=2000, seconds=10.0))
     500 of 2000 shots, 10 s, 50 per s, 30 s left
+    >>> print(jl.Progress(65536, None, 1.5, "photons", error=0.004, rtol=0.01))
+    65536 photons, 1.5 s, relative error 0.004 (aim 0.01)
     """
 
     done: int
-    total: int
+    total: int | None
     seconds: float
     unit: str = "shots"
     stored: int = 0
     converged: int | None = None
+    error: float | None = None
+    rtol: float | None = None
 
     @property
     def rate(self) -> float:
@@ -70,13 +45,22 @@ class TaskProgress:
 
     @property
     def left(self) -> float:
-        """Estimated time left, s; infinite before the first is done."""
+        """Estimated time left, s; infinite before the first is done, and where the total is not known."""
         if self.done == self.total:
             return 0.0
-        return (self.total - self.done) / self.rate if self.rate > 0 else math.inf
+        return (self.total - self.done) / self.rate if self.total and self.rate > 0 else math.inf
 
     def __str__(self) -> str:
-        left = f", {self.left:.3g} s left" if math.isfinite(self.left) else ""
-        converged = "" if self.converged is None else f", {self.converged} converged"
-        count = f"{self.done} of {self.total} {self.unit}{converged}"
-        return f"{count}, {self.seconds:.3g} s, {self.rate:.3g} per s{left}"
+        total = "" if self.total is None else f" of {self.total}"
+        parts = [f"{self.done}{total} {self.unit}"]
+        if self.converged is not None:
+            parts.append(f"{self.converged} converged")
+        parts.append(f"{self.seconds:.3g} s")
+        if self.total is not None:
+            parts.append(f"{self.rate:.3g} per s")
+        if math.isfinite(self.left):
+            parts.append(f"{self.left:.3g} s left")
+        if self.error is not None:
+            target = "" if self.rtol is None else f" (aim {self.rtol:.2g})"
+            parts.append(f"relative error {self.error:.2g}{target}")
+        return ", ".join(parts)

@@ -39,9 +39,6 @@ save_result = RegisteredFunction("saving a result", "jaxlidar.io")
 waveform_html = RegisteredFunction("the figure of a waveform in a notebook", "jaxlidar")
 detect_returns = RegisteredFunction("detecting discrete returns", "jaxlidar.survey.waveforms")
 true_returns = RegisteredFunction("the list of true echoes", "jaxlidar.survey.waveforms")
-decompose_records = RegisteredFunction(
-    "detector = 'decomposition'", "the package inversion (import inversion)"
-)
 simulate_survey = RegisteredFunction("simulating a survey", "jaxlidar.survey.simulate_many")
 
 # The public names of jaxlidar. `jaxlidar.io` finds among them the classes that a table of a TOML file can

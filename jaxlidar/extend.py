@@ -3,7 +3,7 @@
 For laws, pulses and surfaces of your own, and for packages on top such as `inversion`:
 
 - fields: `as_array`, `as_scalar` and, in NumPy's double precision, `as_numpy` convert them, and refuse
-  booleans, times and masked elements; `check_range`, `check_number`, `check_integer`, `check_choice` refuse
+  booleans, times and masked elements; `check_range`, `check_number`, `check_integer` refuse
   values, `check_kind`, `check_numbers`, `check_key` objects of another type; `concrete`
   returns the value of an array, or None where a JAX transformation is tracing it; `even_step` the step of
   times or heights, and refuses uneven ones. `warn_user` warns at the line of the user's code.
@@ -20,14 +20,12 @@ For laws, pulses and surfaces of your own, and for packages on top such as `inve
   GPUs round their factors.
 - `side_by_side` runs compiled programs on as many threads as there are cores; compile them with `ONE_CORE`.
 - `outcomes` runs the tasks that `task` makes, in this process or by the workers of an executor.
-- `decompose_records.register` makes a function the decomposition of `Waveforms.returns`; `inversion` does.
 """
 
 from jaxlidar._fields.checks import (
     as_array,
     as_numpy,
     as_scalar,
-    check_choice,
     check_integer,
     check_key,
     check_kind,
@@ -44,14 +42,12 @@ from jaxlidar._jax.one_function import once
 from jaxlidar._jax.products import einsum, matmul, tensordot
 from jaxlidar._jax.threads import ONE_CORE, side_by_side
 from jaxlidar._jax.workers import outcomes, task
-from jaxlidar._registry import decompose_records
 from jaxlidar._vectors import (
     Scalar,
     Vec,
     about,
     add,
     along,
-    cross,
     dot,
     from_frame,
     normalise,
@@ -72,7 +68,6 @@ __all__ = [
     "as_array",
     "as_numpy",
     "as_scalar",
-    "check_choice",
     "check_integer",
     "check_key",
     "check_kind",
@@ -82,8 +77,6 @@ __all__ = [
     "check_range",
     "check_ranges",
     "concrete",
-    "cross",
-    "decompose_records",
     "dot",
     "einsum",
     "even_step",

@@ -15,6 +15,7 @@ from inversion.fit.fit_summary import CompletedFit
 from inversion.fit.model import Evaluation
 from inversion.fit.solver import EvaluationRequest, FitGenerator, run_fits
 from jaxlidar.extend import side_by_side
+from jaxlidar.planning.setup import Setup
 from jaxlidar.sampling.batch_programs import make_batch_tracer
 
 
@@ -101,7 +102,7 @@ def with_applied_optics(plan: jl.Plan) -> jl.Plan:
     return plan.with_config(keeps_histories=False, degree=0)
 
 
-def one_batch(setup: jl.Setup, key: PRNGKeyArray) -> jl.Waveform:
+def one_batch(setup: Setup, key: PRNGKeyArray) -> jl.Waveform:
     """Return the waveform of a single batch, by the programs that `simulate` compiles."""
     tracer = make_batch_tracer(setup, key)
     response = tracer.batch_function(key)(0)[0] if setup.plan.is_random else tracer.trace(key)

@@ -7,7 +7,6 @@ LONG_EXAMPLES = {
     "inversion.fit.identifiability.profile_likelihood",
     "inversion.fit.log_density.LogDensity",
     "inversion.fit.quality.judge_fit",
-    "inversion.fit.quality.judge_fits",
     "inversion.fit.result.Retrieval",
     "inversion.leaf.leaves.LeafFit",
     "inversion.leaf.leaves.invert_leaves",

@@ -14,13 +14,19 @@ import pytest
 
 import inversion
 import jaxlidar as jl
+from inversion.fit.fit_summary import Step
+from jaxlidar.cli.reference import classes_of_results
+from jaxlidar.plants.lsystem import Symbol
 
 NAMESPACES = (jl, jl.io, inversion)
 CLASSES = {
     f"{namespace.__name__}.{name}": value
     for namespace in NAMESPACES
-    for name in namespace.__all__
-    if inspect.isclass(value := vars(namespace).get(name)) and not inspect.isabstract(value)
+    for name, value in {
+        **{name: vars(namespace).get(name) for name in namespace.__all__},
+        **classes_of_results(namespace),
+    }.items()
+    if inspect.isclass(value) and not inspect.isabstract(value)
 }
 # A handle of this process: what it switches on is no content.
 del CLASSES["jaxlidar.CompilationCache"]
@@ -57,12 +63,11 @@ INSTANCES = {
     "jaxlidar.LeafOptics": jl.LeafOptics(0.4, 0.3),
     "jaxlidar.LeafSurface": jl.leaf_surface(1.4),
     "jaxlidar.Lidar": LIDAR,
-    "jaxlidar.Symbol": jl.Symbol("A", (1.0,)),
+    "jaxlidar.Symbol": Symbol("A", (1.0,)),
     "jaxlidar.Plan": jl.plan(LIDAR, SCENE),
     "jaxlidar.Effect": jl.plan(LIDAR, SCENE).effects[0],
     "jaxlidar.Plane": SCENE.ground.shape,
     "jaxlidar.Plate": jl.Plate(1.0, 0.3),
-    "jaxlidar.Progress": jl.Progress(1, 2, 3.0, 4.0, None),
     "jaxlidar.Prospect": jl.Prospect(),
     "jaxlidar.Receiver": jl.Receiver(saturation=1.0, bits=8),
     "jaxlidar.RectangularPulse": jl.RectangularPulse(),
@@ -72,7 +77,7 @@ INSTANCES = {
     "jaxlidar.Setup": jl.make_setup(LIDAR, SCENE, jl.plan(LIDAR, SCENE)),
     "jaxlidar.Specular": jl.Specular(0.1),
     "jaxlidar.Spectrum": jl.spectrum("bark-oak"),
-    "jaxlidar.TaskProgress": jl.TaskProgress(1, 2, 3.0, "fits", 0, 1),
+    "jaxlidar.Progress": jl.Progress(1, 2, 3.0, "fits", 0, 1),
     "jaxlidar.Tree": jl.grow(jl.shrub()),
     "jaxlidar.UnitWarning": jl.UnitWarning("divergence"),
     "jaxlidar.VoxelMap": VOXELS,
@@ -83,7 +88,7 @@ INSTANCES = {
     "jaxlidar.io.Case": jl.io.Case(LIDAR, SCENE, jax.random.key(0), {"rtol": 0.1}),
     "inversion.LogNormal": inversion.LogNormal(0.3, 0.5),
     "inversion.Smooth": inversion.Smooth(4.0, spacing=1.5, mean=[0.1, 0.2]),
-    "inversion.Step": inversion.Step(1, 2.0, True, {"a": np.ones(2)}),
+    "inversion.Step": Step(1, 2.0, True, {"a": np.ones(2)}),
     "inversion.Unknown": inversion.Unknown("ground.height", bounds=(0.0, 1.0)),
 }
 

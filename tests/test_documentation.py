@@ -18,10 +18,16 @@ import jaxlidar
 import jaxlidar.extend
 import jaxlidar.io
 import jaxlidar.plot
+from jaxlidar.cli.reference import classes_of_results
 
 NAMESPACES = (jaxlidar, jaxlidar.io, jaxlidar.plot, inversion)
 PUBLIC = {
-    f"{module.__name__}.{name}": getattr(module, name) for module in NAMESPACES for name in module.__all__
+    f"{module.__name__}.{name}": value
+    for module in NAMESPACES
+    for name, value in {
+        **{name: getattr(module, name) for name in module.__all__},
+        **classes_of_results(module),
+    }.items()
 }
 CALLABLE = {name: value for name, value in PUBLIC.items() if callable(value)}
 FUNCTIONS = {name: value for name, value in CALLABLE.items() if not inspect.isclass(value)}

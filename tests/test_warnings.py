@@ -1,5 +1,9 @@
-"""A warning names the user's line, whatever lies between that line and the place that warns."""
+"""A warning names the user's line, whatever lies between that line and the place that warns.
 
+Tests check types by the import hook of jaxtyping (see conftest): its frames lie between too.
+"""
+
+import dataclasses
 import linecache
 
 import equinox as eqx
@@ -75,8 +79,32 @@ def test_a_reader(tmp_path):
     assert "jl.io.read_qsm(" in line_of_warning(lambda: jl.io.read_qsm(path), jl.io.FileWarning)
 
 
-def test_a_constructor():
-    assert "jl.Lidar(" in line_of_warning(lambda: jl.Lidar(divergence=3e-4), jl.UnitWarning)
+def table_of_trees(path):
+    path.write_text("x,y,height,crown_radius\n0,0,5,1\n")
+    return path
+
+
+VOXELS = jl.VoxelMap.from_lad(np.full((2, 2, 2), 0.5), voxel_size=1.0, origin=(0.0, 0.0, 300.0))
+TREE = jl.Canopy(VOXELS, leaf=jl.LeafOptics(0.4, 0.4))
+MEADOW = jl.Terrain(np.zeros((2, 2)), spacing=2.0)
+SCAN = jl.RotatingPolygon(half_angle=20.0, line_rate=100.0)
+LINE = {"start": (0.0, 0.0), "end": (0.0, 5.0), "speed": 60.0}
+# Entry points of several kinds, each on one line, and the classes of their warnings.
+ENTRY_POINTS = {
+    "jl.Lidar(": (lambda path: jl.Lidar(divergence=3e-4), jl.UnitWarning),
+    "dataclasses.replace(": (lambda path: dataclasses.replace(LIDAR, divergence=3e-4), jl.UnitWarning),
+    "jl.RotatingPolygon(": (lambda path: jl.RotatingPolygon(half_angle=0.3, line_rate=9.0), jl.UnitWarning),
+    "jl.Survey.scan(": (lambda path: jl.Survey.scan(LIDAR, SCAN, **LINE, pulse_rate=0.3), jl.UnitWarning),
+    "jl.record(": (lambda path: jl.record(np.ones((1, 2)), 1.064, jl.Receiver()), jl.UnitWarning),
+    "jl.Scene(": (lambda path: jl.Scene(canopy=TREE, ground=MEADOW), jl.MisplacedCanopyWarning),
+    "jl.io.read_inventory(": (lambda path: jl.io.read_inventory(table_of_trees(path)), UserWarning),
+}
+
+
+@pytest.mark.parametrize("call", ENTRY_POINTS)
+def test_entry_points(call, tmp_path):
+    function, category = ENTRY_POINTS[call]
+    assert call in line_of_warning(lambda: function(tmp_path / "table.csv"), category)
 
 
 def test_frames_of_other_packages_are_the_users():

@@ -52,7 +52,7 @@ def main() -> None:
     )
     heights = jnp.array([0.0, 1.0])
     leaves = jax.vmap(lambda n: jl.Prospect(**{**TRAITS, "N": n}))(jnp.linspace(1.2, 2.4, LEAVES))
-    spectra = jax.jit(lambda x: jl.prospect_spectra(x, SPECTRUM, 20))
+    spectra = jax.jit(lambda x: jax.lax.map(lambda leaf: leaf(SPECTRUM), x, batch_size=20))
     times = race(
         {
             "simulate to 1 %": simulation,

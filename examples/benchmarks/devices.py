@@ -99,7 +99,7 @@ def leaf_spectra(leaves: int, rounds: int) -> dict[str, float]:
     wavelengths = np.arange(400.0, 2501.0)
     cab = jnp.linspace(20.0, 60.0, leaves)
     batch = jax.vmap(lambda c: jl.Prospect(Cab=c))(cab)
-    spectra = jax.jit(lambda x: jl.prospect_spectra(x, wavelengths, min(leaves, 1000)))
+    spectra = jax.jit(lambda x: jax.lax.map(lambda leaf: leaf(wavelengths), x, batch_size=min(leaves, 1000)))
     return {"leaves": leaves, **best(race({"warm": lambda: spectra(batch)}, rounds))}
 
 

@@ -74,7 +74,7 @@ def synthetic_leaves(count: int = 200) -> dict[str, np.ndarray]:
     def spectra(share: float) -> np.ndarray:
         content = {name: v * (1 if name == "N" else 1 + share) for name, v in traits.items()}
         leaves = jax.vmap(lambda t: jl.Prospect(**t))(content)
-        return np.stack([np.asarray(s, float) for s in jl.prospect_spectra(leaves, bands)], axis=1)
+        return np.stack([np.asarray(s, float) for s in leaves(bands)], axis=1)
 
     exact = spectra(0.0)
     slope = (spectra(0.001) - exact) / 0.001

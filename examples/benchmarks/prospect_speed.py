@@ -43,14 +43,14 @@ def main() -> None:
 
     contestants = {"prosail": lambda: loop(traits, n_looped)}
     for b in BATCHES:
-        spectra = jax.jit(lambda x, b=b: jl.prospect_spectra(x, WAVELENGTHS, b))
-        jacobian = jax.jit(lambda x, b=b: jl.prospect_jacobian(x, WAVELENGTHS, b))
+        spectra = jax.jit(lambda x, b=b: jax.lax.map(lambda leaf: leaf(WAVELENGTHS), x, batch_size=b))
+        jacobian = jax.jit(lambda x, b=b: x.jacobian(WAVELENGTHS, b))
         contestants[f"spectra {b}"] = lambda run=spectra: run(batch)
         contestants[f"jacobian {b}"] = lambda run=jacobian: run(batch)
     times = best(race(contestants, arguments.rounds))
     seconds_per_leaf = {name: t / (n_looped if name == "prosail" else n) for name, t in times.items()}
 
-    R, T = jl.prospect_spectra(batch, WAVELENGTHS, 100)
+    R, T = batch(WAVELENGTHS)
     prosail_spectra = loop(traits, n_looped)
     error = max(
         float(abs(R[i] - r).max() + abs(T[i] - t).max()) for i, (_, r, t) in enumerate(prosail_spectra)

@@ -49,7 +49,7 @@ def main(argv=None):
         with jax.enable_x64(precision == "float64"):
             make = jax.vmap(lambda t, v=version, a=alpha: jl.Prospect(**t, version=v, alpha=a))
             leaves = make({name: jnp.asarray(v) for name, v in content.items()})
-            spectra = np.stack([np.asarray(s, float) for s in jl.prospect_spectra(leaves, BANDS)])
+            spectra = np.stack([np.asarray(s, float) for s in leaves(BANDS)])
         kind, incidence = f"version {version}, {precision}", f"{alpha:g} degrees"
         largest_differences[f"{kind}, {incidence}"] = np.abs(spectra - exact).max(axis=1)
         for name, our_values, prosail_values in zip(("reflectance", "transmittance"), spectra, exact):

@@ -57,7 +57,7 @@ from inversion.fit.unknowns import (
     set_lidar_values,
     split_values,
 )
-from jaxlidar import Lidar, Plan, Response, Scene
+from jaxlidar import Lidar, Plan, Scene
 from jaxlidar.extend import (
     as_numpy,
     check_integer,
@@ -69,6 +69,7 @@ from jaxlidar.extend import (
 )
 from jaxlidar.planning.effects import effects_of_family
 from jaxlidar.planning.scene_family import check_scenes, plan_cases
+from jaxlidar.trace.response import Response
 
 # Fields of a lidar that can be free: those that act after the trace, of which `inversion.fit.unknowns` names
 # those that records determine, and the divergence, which is interpolated.

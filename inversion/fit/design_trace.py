@@ -26,9 +26,10 @@ from inversion.fit.model import SimulationInputs, Values
 from inversion.fit.planning import N_BATCHES
 from inversion.fit.prior_residuals import fixed_priors
 from inversion.fit.unknowns import BoundUnknown, flat_bounds, flat_start
-from jaxlidar import Lidar, Plan, Response, Scene, total_reflectance, trace_scene
+from jaxlidar import Lidar, Plan, Scene, total_reflectance, trace_scene
 from jaxlidar.extend import tensordot
 from jaxlidar.spectral.apply_optics import make_free_sampling_model, total_samples
+from jaxlidar.trace.response import Response
 
 
 class DivergenceNodes(eqx.Module):

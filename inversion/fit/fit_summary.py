@@ -37,7 +37,8 @@ class Step:
 
     >>> import jaxlidar as jl
     >>> import inversion
-    >>> print(inversion.Step(number=2, reduced_chi2=1.5, accepted=False, values={"height": 0.25}))
+    >>> from inversion.fit.fit_summary import Step
+    >>> print(Step(number=2, reduced_chi2=1.5, accepted=False, values={"height": 0.25}))
     step 2: chi2 = 1.5 (not kept); height = 0.25
     """
 

@@ -185,7 +185,8 @@ class Profile(eqx.Module):
     >>> import inversion
     >>> import numpy as np
     >>> chi2, converged = np.array([4.0, 0.0, 4.0, 16.0]), np.full(4, True)
-    >>> profile = inversion.Profile(np.array([0.0, 0.1, 0.2, 0.3]), chi2, others={}, converged=converged)
+    >>> from inversion.fit.identifiability import Profile
+    >>> profile = Profile(np.array([0.0, 0.1, 0.2, 0.3]), chi2, others={}, converged=converged)
     >>> low, high = profile.interval(0.95)
     >>> print(f"{low:.3f} to {high:.3f}")
     0.002 to 0.198

@@ -44,8 +44,9 @@ from inversion.fit.prior_residuals import fixed_priors
 from inversion.fit.problem import Problem, check_problem
 from inversion.fit.recorder_model import RecorderModel
 from inversion.fit.unknowns import flat_bounds, flat_labels, flat_start, split_values
-from jaxlidar import Response, total_reflectance
+from jaxlidar import total_reflectance
 from jaxlidar.extend import as_numpy, check_key, check_range, matmul, tensordot
+from jaxlidar.trace.response import Response
 
 Shapes = tuple[tuple[int, ...], ...]
 

@@ -1,6 +1,6 @@
 r"""Forward model of a fit: the simulated waveform and its Jacobian, each column in the cheapest way.
 
-The waveform w(x) of the unknowns x is linear in the traced response (`jaxlidar.Response`): w = optics(x)
+The waveform w(x) of the unknowns x is linear in the traced response (`jaxlidar.trace_scene`): w = optics(x)
 applied to response(x). A column dw/dx_k of the Jacobian is computed
 
 - for an *optical* unknown from the derivative of the optics: a small matrix product with the response;
@@ -44,9 +44,7 @@ from inversion.fit.unknowns import BoundUnknown, Dependence, Setter, set_lidar_v
 from jaxlidar import (
     Lidar,
     Plan,
-    Response,
     Scene,
-    Setup,
     Waveform,
     make_setup,
     total_reflectance,
@@ -56,11 +54,12 @@ from jaxlidar import (
 from jaxlidar.extend import ONE_CORE, concrete, side_by_side
 from jaxlidar.planning.memory import format_bytes, memory_limit, scored_bytes
 from jaxlidar.planning.plan_check import is_in_reach
+from jaxlidar.planning.setup import Setup
 from jaxlidar.spectral.apply_optics import derivatives_to_samples, make_waveform_model, setup_optics
 from jaxlidar.trace.derivatives.extinction_slopes import ExtinctionSlopes
 from jaxlidar.trace.derivatives.score_functions import make_slopes
 from jaxlidar.trace.device_scene import build_device_scene
-from jaxlidar.trace.response import trace_with_scores
+from jaxlidar.trace.response import Response, trace_with_scores
 
 Values = tuple[Array, ...]
 # Batches of a pilot evaluation: a quarter of the work of all, and the least that shows its own noise.

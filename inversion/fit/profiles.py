@@ -129,7 +129,8 @@ class AveragingKernel(NamedTuple):
     **Example:** a diagonal of one half: two layers for each number from the data.
 
     >>> import inversion, numpy as np
-    >>> kernel = inversion.AveragingKernel(0.5 * np.eye(4), np.array(2.0), np.full(4, 1.5 / 0.5))
+    >>> from inversion.fit.profiles import AveragingKernel
+    >>> kernel = AveragingKernel(0.5 * np.eye(4), np.array(2.0), np.full(4, 1.5 / 0.5))
     >>> kernel.resolution.tolist()
     [3.0, 3.0, 3.0, 3.0]
     """

@@ -1,7 +1,7 @@
 """Verdicts on fits of recorded waveforms: "good", "doubtful" or "bad", with reasons.
 
 A verdict is the worst of a small set of named checks; each check that fails gives a reason. The checks of a
-fit (`judge_fit`, `judge_fits`), with n the effective number of independent samples:
+fit (`judge_fit`), with n the effective number of independent samples:
 
 | check | doubtful | bad |
 | --- | --- | --- |
@@ -33,7 +33,7 @@ The thresholds hold for any instrument; the checks of a record need several samp
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import Any, NamedTuple, Protocol, runtime_checkable
+from typing import Any, NamedTuple, Protocol, overload, runtime_checkable
 
 import numpy as np
 from jaxtyping import ArrayLike, Float
@@ -81,8 +81,8 @@ class Verdict(NamedTuple):
 
 
 @runtime_checkable
-class JudgedFit(Protocol):
-    """The quantities of a fit (`Retrieval`), or of many (`Retrievals`), on which a verdict depends."""
+class _JudgedQuantities(Protocol):
+    """The quantities on which a verdict depends, of a fit or of many."""
 
     @property
     def values(self) -> Mapping[str, Any]: ...
@@ -97,13 +97,27 @@ class JudgedFit(Protocol):
     @property
     def strength(self) -> Mapping[str, Any]: ...
     @property
-    def converged(self) -> Any: ...
-    @property
     def reduced_chi2(self) -> Any: ...
     @property
     def independent_samples(self) -> Any: ...
     @property
     def second_minimum(self) -> Any: ...
+
+
+@runtime_checkable
+class _JudgedFit(_JudgedQuantities, Protocol):
+    """A fit, such as `Retrieval`."""
+
+    @property
+    def converged(self) -> bool: ...
+
+
+@runtime_checkable
+class _JudgedFits(_JudgedQuantities, Protocol):
+    """Many fits, such as `Retrievals`."""
+
+    @property
+    def converged(self) -> np.ndarray: ...
 
 
 def _worst_of(failures: Iterable[tuple[str, str]]) -> Verdict:
@@ -112,16 +126,26 @@ def _worst_of(failures: Iterable[tuple[str, str]]) -> Verdict:
     return Verdict(ordered[0][0] if ordered else _GOOD, tuple(reason for _, reason in ordered))
 
 
-def judge_fit(fit: JudgedFit, *, about: Sequence[str] | None = None) -> Verdict:
+@overload
+def judge_fit(fit: _JudgedFits, *, about: Sequence[str] | None = None) -> tuple[Verdict, ...]: ...
+
+
+@overload
+def judge_fit(fit: _JudgedFit, *, about: Sequence[str] | None = None) -> Verdict: ...
+
+
+def judge_fit(
+    fit: _JudgedFit | _JudgedFits, *, about: Sequence[str] | None = None
+) -> Verdict | tuple[Verdict, ...]:
     """Judge whether a fit can be trusted, by the first table of `inversion.fit.quality`.
 
     **Arguments:**
 
-    - `fit`: a `Retrieval`, the result of `retrieve`.
+    - `fit`: a `Retrieval`, the result of `retrieve`, or the `Retrievals` of `retrieve_many`.
     - `about`: names of the unknowns that the verdict is about; bounds and priors of others are ignored.
       Default None: all.
 
-    **Returns:** a `Verdict`.
+    **Returns:** a `Verdict`; of many fits, one for each.
 
     **Raises:** ValueError for a name that the fit does not have.
 
@@ -137,36 +161,13 @@ def judge_fit(fit: JudgedFit, *, about: Sequence[str] | None = None) -> Verdict:
     >>> inversion.judge_fit(fit).quality
     'bad'
     """
-    # The index () leaves the quantities of a single fit as they are.
-    return _judge(fit, about, ())
+    if np.ndim(fit.converged) == 0:
+        # The index () leaves the quantities of a single fit as they are.
+        return _judge(fit, about, ())
+    return tuple(_judge(fit, about, i) for i in range(np.size(fit.converged)))
 
 
-def judge_fits(fits: Any, *, about: Sequence[str] | None = None) -> tuple[Verdict, ...]:
-    """Judge whether each of many fits can be trusted: see `judge_fit`.
-
-    **Arguments:** `fits`: a `Retrievals`, the result of `retrieve_many`. `about`: as for `judge_fit`.
-
-    **Returns:** a `Verdict` for each footprint.
-
-    **Raises:** ValueError for a name that the fits do not have.
-
-    **Example:**
-
-    >>> import jaxlidar as jl
-    >>> import inversion, jax
-    >>> scene = jl.Scene(ground=jl.Ground(height=0.5))
-    >>> wave = jl.simulate(jl.Lidar(), scene, key=jax.random.key(0))
-    >>> unknown = inversion.Unknown("ground.reflectance", bounds=(0.0, 1.0), name="brightness")
-    >>> records, time = wave.reflectance[None], wave.time
-    >>> problem = inversion.Problem(records, jl.Lidar(), scene, [unknown], noise=0.001, time=time)
-    >>> fits = inversion.retrieve_many(problem, key=jax.random.key(1))
-    >>> inversion.judge_fits(fits, about=["brightness"])
-    (Verdict(quality='good', reasons=()),)
-    """
-    return tuple(_judge(fits, about, i) for i in range(len(fits.status)))
-
-
-def _judge(fit: JudgedFit, about: Sequence[str] | None, index: Any) -> Verdict:
+def _judge(fit: _JudgedFit | _JudgedFits, about: Sequence[str] | None, index: Any) -> Verdict:
     """Judge a fit (index ()), or one of many by its index."""
 
     def scalar(x: Any) -> float:

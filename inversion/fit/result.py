@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from inversion.fit.fit_summary import CompletedFit, FitSummary, short_text
 from inversion.fit.profiles import AbstractPosterior
-from inversion.fit.quality import Verdict, judge_fit, judge_fits
+from inversion.fit.quality import Verdict, judge_fit
 from inversion.fit.uncertainty import correlation_of
 from inversion.fit.unknowns import BoundUnknown, bounds_by_name, flat_labels, smooth_names, split_by_name
 from jaxlidar import Scene, Waveform
@@ -182,8 +182,8 @@ class Retrievals(AbstractPosterior):
 
     @property
     def quality(self) -> tuple[Verdict, ...]:
-        """Verdict on each fit, with reasons: `inversion.judge_fits` with all unknowns."""
-        return judge_fits(self)
+        """Verdict on each fit, with reasons: `inversion.judge_fit` with all unknowns."""
+        return judge_fit(self)
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the results as a netCDF file, which `jaxlidar.open` reads.

@@ -43,7 +43,7 @@ from inversion.fit.solver import (
     run_fits,
 )
 from inversion.fit.unknowns import BoundUnknown
-from jaxlidar import Lidar, Scene, TaskProgress
+from jaxlidar import Lidar, Progress, Scene
 from jaxlidar.extend import (
     ONE_CORE,
     check_integer,
@@ -73,7 +73,7 @@ def retrieve_many(
     lanes: int = 16,
     path: str | os.PathLike[str] | None = None,
     executor: Executor | None = None,
-    progress: Callable[[TaskProgress], None] | None = None,
+    progress: Callable[[Progress], None] | None = None,
 ) -> Retrievals:
     """Retrieve the unknowns of a problem of many records, from each separately, as `retrieve` does from one.
 
@@ -95,7 +95,7 @@ def retrieve_many(
     - `executor`: a `concurrent.futures.Executor`, whose workers fit chunks of records, as for
       `jaxlidar.simulate_many`. Unknowns are sent to them: give paths, or functions of a module. A chunk whose
       worker dies gets a second try. Default None: this process.
-    - `progress`: called with a `TaskProgress` after every fit.
+    - `progress`: called with a `Progress` after every fit.
 
     **Returns:** a `Retrievals`, which does not depend on the number of workers.
 
@@ -164,7 +164,7 @@ def retrieve_many(
             if progress is not None:
                 n_converged = sum(fit.converged for fit in finished.summaries.values())
                 counts = len(finished.summaries), n_footprints
-                progress(TaskProgress(*counts, perf_counter() - start_time, "fits", n_stored, n_converged))
+                progress(Progress(*counts, perf_counter() - start_time, "fits", n_stored, n_converged))
     return retrievals_of([finished.summaries[i] for i in range(n_footprints)], all_unknowns)
 
 

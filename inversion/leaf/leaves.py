@@ -93,7 +93,7 @@ class LeafFit(eqx.Module):
     - `at_bound`: by name, (leaves,) True if the value lies on one of its bounds.
     - `domain`: by name, (intervals, 2) first and last wavelength, nm, of the bands that gave the trait; of
       leaves other than needles, if there are any.
-    - `leaves`: the fitted leaves, for `prospect_spectra`: a `Prospect` whose traits have shape (leaves,).
+    - `leaves`: the fitted leaves: a `Prospect` whose traits have shape (leaves,).
     - `rmse`: (leaves,) root mean square of the residuals of all samples used, of both spectra; zero for a
       leaf without samples. This and the next two are of the fit to all bands.
     - `reduced_chi2`: (leaves,) sum of squared residuals over their variances, divided by the number of

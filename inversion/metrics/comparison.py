@@ -63,7 +63,8 @@ class ComparisonStatistics(NamedTuple):
     **Example:**
 
     >>> import inversion
-    >>> row = inversion.ComparisonStatistics("ground", "all", 2, -0.1, -0.1, 0.1, 0.1, float("nan"), 1.0)
+    >>> from inversion.metrics.comparison import ComparisonStatistics
+    >>> row = ComparisonStatistics("ground", "all", 2, -0.1, -0.1, 0.1, 0.1, float("nan"), 1.0)
     >>> row.bias
     -0.1
     """

@@ -29,16 +29,9 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from inversion.metrics.heights import SignalEnds, relative_ground, relative_signal_ends
-from inversion.metrics.records import (
-    PaddedRecord,
-    Pulse,
-    divide_by_largest,
-    over_shots,
-    pad_record,
-    sample_pulse_at_heights,
-    smooth_pulse,
-)
+from inversion.metrics.records import PaddedRecord, pad_record, sample_pulse_at_heights, smooth_pulse
 from jaxlidar.extend import as_array, check_numbers, check_range, concrete
+from jaxlidar.survey.records import Pulse, divide_by_largest, over_shots
 
 # Least fraction of a pulse after its mode, and least energy of an echo's lower half over the largest sample,
 # that are divided by.
@@ -57,7 +50,8 @@ class GroundAndCanopy(NamedTuple):
     **Example:** plant area of two records.
 
     >>> import inversion, numpy as np
-    >>> split = inversion.GroundAndCanopy(*np.array([[2.0, 3.0], [50.0, 80.0], [25.0, 0.0], [0.75, 0.5]]))
+    >>> from inversion.metrics.cover import GroundAndCanopy
+    >>> split = GroundAndCanopy(*np.array([[2.0, 3.0], [50.0, 80.0], [25.0, 0.0], [0.75, 0.5]]))
     >>> np.round(inversion.plant_area_index(split.gap), 2)
     Array([0.58, 1.39], dtype=float32)
     """
@@ -185,7 +179,7 @@ def _split_energy(step, power, n_samples, pulse, ground, top, bottom):
         return jnp.sum(jnp.where(is_recorded, power * fraction, 0.0))
 
     signal_energy = above(bottom) - above(top)
-    # Of the smoothed pulse, as `find_ground` reads the smoothed record.
+    # The mode of the smoothed pulse, as `find_ground` reads the smoothed record.
     mode = smooth_pulse(pulse).mode
     late_energy = above(bottom) - above(ground - mode * step)
     lag = jnp.arange(pulse.size, dtype=pulse.dtype) - pulse.size // 2

@@ -26,8 +26,8 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, ArrayLike, Float
 
-from inversion.metrics.records import divide_by_largest
 from jaxlidar.extend import check_integer, check_range, concrete
+from jaxlidar.survey.records import divide_by_largest
 
 # Least model of a sample that one is divided by, over the largest sample of the waveform.
 _LEAST_MODEL = 1e-6
@@ -119,7 +119,7 @@ def wiener(
 @jax.jit
 def _wiener(y: Samples, h: Float[Array, " lags"], noise_to_signal: Array) -> Samples:
     """Deconvolve a record `y` by a pulse `h` of unit sum."""
-    # Of the full convolution of record and pulse: the transforms do not wrap around.
+    # The size of the full convolution of record and pulse: the transforms do not wrap around.
     size = y.size + h.size - 1
     spectrum = jnp.fft.rfft(h, size)
     gain = jnp.conj(spectrum) / (jnp.abs(spectrum) ** 2 + noise_to_signal)

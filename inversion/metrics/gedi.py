@@ -34,8 +34,9 @@ from jax import lax
 from jaxtyping import Array, Float, Int
 
 from inversion.fit.quality import Verdict, judge_record
-from inversion.metrics.records import refuse_baseline, size_bucket
+from inversion.metrics.records import refuse_baseline
 from jaxlidar.extend import as_array, as_numpy, check_integer, check_number, check_range, even_step
+from jaxlidar.survey.records import size_bucket
 
 # Subdivisions of a bin, where a Gaussian is cut (in standard deviations), and shots computed at a time.
 _SUBDIVISIONS, _CUT, _CHUNK = 4, 2.5, 64

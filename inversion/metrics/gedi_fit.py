@@ -30,7 +30,7 @@ from jaxtyping import Float, Int
 
 import jaxlidar as jl
 from inversion.fit.problem import Problem
-from inversion.fit.quality import Verdict, judge_fits
+from inversion.fit.quality import Verdict, judge_fit
 from inversion.fit.result import Retrievals
 from inversion.fit.retrieval_many import retrieve_many
 from inversion.fit.unknowns import Unknown
@@ -176,7 +176,7 @@ def fit_gedi_shots(
     lowest_mode: Float[np.ndarray, " shots"],
     *,
     path: str | os.PathLike[str] | None = None,
-    progress: Callable[[jl.TaskProgress], None] | None = None,
+    progress: Callable[[jl.Progress], None] | None = None,
 ) -> GediFits:
     """Fit shots, some of them from two grounds, all in one batch.
 
@@ -205,7 +205,7 @@ def fit_gedi_shots(
         candidates.append(range(len(prepared), len(prepared) + len(starts)))
         prepared += starts
     retrievals = _fit(prepared, path, progress) if prepared else None
-    fit_verdicts = () if retrievals is None else judge_fits(retrievals, about=["ground"])
+    fit_verdicts = () if retrievals is None else judge_fit(retrievals, about=["ground"])
     fits = _empty_fits(len(shots), retrievals)
     verdicts = []
     for i, (shot, numbers) in enumerate(zip(shots, candidates)):
@@ -241,7 +241,7 @@ def _prepare(shot: Any, ground: float, lowest_mode: float) -> list[PreparedShot]
 def _fit(
     prepared: list[PreparedShot],
     path: str | os.PathLike[str] | None,
-    progress: Callable[[jl.TaskProgress], None] | None,
+    progress: Callable[[jl.Progress], None] | None,
 ) -> Retrievals:
     """Fit prepared shots in one batch."""
     size = max(np.size(p.shot.pulse_time) for p in prepared)

@@ -49,9 +49,8 @@ from inversion.metrics.gedi import (
 )
 from inversion.metrics.gedi_fit import CANOPY, ESTIMATES, LAYER_ESTIMATES, fit_gedi_shots
 from inversion.metrics.heights import find_ground, signal_ends
-from inversion.metrics.records import size_bucket
 from inversion.scene.layered_canopy import LAYERS, REFLECTANCE_RATIO
-from jaxlidar import TaskProgress
+from jaxlidar import Progress
 from jaxlidar.extend import (
     as_numpy,
     check_integer,
@@ -60,9 +59,11 @@ from jaxlidar.extend import (
     check_range,
     even_step,
 )
-from jaxlidar.io import Column, ColumnAxis, GediShot, ShotTable
+from jaxlidar.io import Column, GediShot, ShotTable
 from jaxlidar.io.gedi import IncompleteShot, read_gedi_rows
 from jaxlidar.io.store import check_store_path
+from jaxlidar.io.tables import ColumnAxis
+from jaxlidar.survey.records import size_bucket
 
 # Setting groups of the product, and shots that are computed at once.
 _GROUPS, _BATCH = range(1, 7), 64
@@ -102,7 +103,7 @@ def gedi_table(
     clumping: float = 1.0,
     fit: bool = False,
     path: str | os.PathLike[str] | None = None,
-    progress: Callable[[TaskProgress], Any] | None = None,
+    progress: Callable[[Progress], Any] | None = None,
 ) -> ShotTable:
     """Return a table of GEDI shots: ground, relative heights, cover and plant area, with standard errors.
 
@@ -123,7 +124,7 @@ def gedi_table(
     - `fit`: also fit a layered canopy over sloping ground to each shot, see below. Default False.
     - `path`: a Zarr store of every fit that has ended, as for `inversion.retrieve_many`: the same call
       continues with it. Default None: no store.
-    - `progress`: called with a `TaskProgress` after each batch of shots, and after each fit. Default None.
+    - `progress`: called with a `Progress` after each batch of shots, and after each fit. Default None.
 
     **Returns:** a `jaxlidar.io.ShotTable`, a row for each shot in their order, with
 
@@ -211,7 +212,7 @@ def gedi_table(
             estimates[name][batch] = values
         if progress is not None:
             seconds = time.perf_counter() - start_time
-            progress(TaskProgress(int(first + batch.size), int(usable.size), seconds))
+            progress(Progress(int(first + batch.size), int(usable.size), seconds))
     verdicts = [_verdict_after(verdict, estimates, i) for i, verdict in enumerate(verdicts)]
     table = _table(rows, estimates, verdicts, group, structure)
     if not fit:
@@ -598,7 +599,7 @@ def _fit_columns(
     estimates: dict[str, np.ndarray],
     verdicts: list[Verdict],
     path: str | os.PathLike[str] | None,
-    progress: Callable[[TaskProgress], Any] | None,
+    progress: Callable[[Progress], Any] | None,
 ) -> tuple[dict[str, Column], dict[str, str]]:
     """Return the columns of fits, and the attributes that describe them.
 

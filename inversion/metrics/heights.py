@@ -38,16 +38,14 @@ from jaxtyping import Array, ArrayLike, Float
 from inversion.metrics.records import (
     NORMAL_MEDIAN,
     PaddedRecord,
-    Pulse,
     check_background,
-    over_shots,
     pad_record,
     sample_pulse_at_heights,
-    size_bucket,
     smooth_pulse,
     vertex_offset,
 )
 from jaxlidar.extend import as_array, check_range
+from jaxlidar.survey.records import Pulse, over_shots, size_bucket
 
 # Sigma clipping: largest noise in standard deviations, and number of iterations.
 _CLIP, _CLIP_ITERATIONS = 3.0, 5
@@ -73,7 +71,8 @@ class SignalEnds(NamedTuple):
 
     >>> import inversion, numpy as np
     >>> height = np.arange(20.0, -5.0, -0.5)
-    >>> ends = inversion.SignalEnds(top=10.0, bottom=0.0)
+    >>> from inversion.metrics.heights import SignalEnds
+    >>> ends = SignalEnds(top=10.0, bottom=0.0)
     >>> print(inversion.relative_heights(height, np.ones(height.size), levels=(50.0,), ends=ends))
     [5.]
     """

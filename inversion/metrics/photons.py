@@ -31,9 +31,10 @@ from jaxtyping import ArrayLike, Float, Int, Shaped
 from scipy import linalg, spatial, special, stats
 
 from inversion.fit.quality import Verdict
-from jaxlidar import SPEED_OF_LIGHT, PhotonEvents
+from jaxlidar import SPEED_OF_LIGHT
 from jaxlidar.extend import as_numpy, check_integer, check_kind, check_range
-from jaxlidar.io import PhotonTrack
+from jaxlidar.io.icesat2 import PhotonTrack
+from jaxlidar.sensors.photon_counter import PhotonEvents
 
 # Half-axes of the ellipse in m: along the track, in height.
 _ALONG, _HIGH = 10.0, 3.0
@@ -107,7 +108,8 @@ class PhotonHeights(NamedTuple):
 
     >>> import inversion, numpy as np
     >>> segment = np.array([10.0])
-    >>> heights = inversion.PhotonHeights(segment, segment, segment, segment, label=np.array([0, 1, 2, 2]))
+    >>> from inversion.metrics.photons import PhotonHeights
+    >>> heights = PhotonHeights(segment, segment, segment, segment, label=np.array([0, 1, 2, 2]))
     >>> print(np.mean(heights.label == 2))
     0.5
     """
@@ -186,7 +188,7 @@ def photon_ground_and_canopy(
     >>> survey = jl.Survey.track(lidar, start=(0, 0), end=(60, 0), spacing=0.7)
     >>> many = jl.simulate_many(survey, jl.Scene(ground=jl.Ground(height=3.0)), key=jax.random.key(0))
     >>> sun = jl.PhotonCounter(background_rate=2e6, window=(-300.0, 300.0))
-    >>> events = jl.record(many, receiver=sun, mode="photons", key=jax.random.key(1))
+    >>> events = sun.count(many, key=jax.random.key(1))
     >>> heights = inversion.photon_ground_and_canopy(events, survey.position[:, 0])
     >>> print(f"{np.mean(heights.ground):.1f} m, {np.isfinite(heights.canopy).sum()} segments with canopy")
     3.0 m, 0 segments with canopy

@@ -10,8 +10,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from inversion.metrics.decomposition import Echoes
 from jaxlidar.io import AirborneShot
+from jaxlidar.survey.decomposition import Echoes
 
 
 class EchoPoints(NamedTuple):
@@ -27,7 +27,8 @@ class EchoPoints(NamedTuple):
     >>> import numpy as np
     >>> import inversion
     >>> position, number = np.array([[0.0, 0.0, 12.5]]), np.array([1])
-    >>> points = inversion.EchoPoints(position, np.array([310.0]), number, number, np.array([2.5]))
+    >>> from inversion.metrics.points import EchoPoints
+    >>> points = EchoPoints(position, np.array([310.0]), number, number, np.array([2.5]))
     >>> points.position[0, 2]
     np.float64(12.5)
     """

@@ -56,7 +56,8 @@ class ShotResponse(NamedTuple):
     **Example:** the energy that follows an echo's Gaussian part.
 
     >>> import inversion, numpy as np
-    >>> response = inversion.ShotResponse(np.array([0.0, 0.9, 0.1]), 0.3, 0.1, 1.0, np.arange(3))
+    >>> from inversion.receiver.shot_response import ShotResponse
+    >>> response = ShotResponse(np.array([0.0, 0.9, 0.1]), 0.3, 0.1, 1.0, np.arange(3))
     >>> response.tail_fraction
     0.1
     """

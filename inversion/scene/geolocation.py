@@ -124,7 +124,8 @@ class Geolocation(NamedTuple):
     **Example:** 95 % limits of the shift.
 
     >>> import inversion, numpy as np
-    >>> place = inversion.Geolocation(
+    >>> from inversion.scene.geolocation import Geolocation
+    >>> place = Geolocation(
     ...     np.array([8.0, -3.0]), np.diag([0.04, 0.01]), None, None, 0.0, np.zeros((1, 2)), np.ones(1),
     ...     np.zeros((1, 9)), 1.0, "converged",
     ... )

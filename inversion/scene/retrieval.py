@@ -99,7 +99,8 @@ class SceneStep:
     **Example:**
 
     >>> import inversion
-    >>> print(inversion.SceneStep(stage="fit", number=3, misfit=1.31, held_out_misfit=1.42))
+    >>> from inversion.scene.retrieval import SceneStep
+    >>> print(SceneStep(stage="fit", number=3, misfit=1.31, held_out_misfit=1.42))
     fit 3: misfit 1.31, held out 1.42
     """
 

@@ -11,7 +11,6 @@ import numpy as np
 from jaxlidar.cli.shared import ResultPath
 from jaxlidar.io import (
     AirborneShot,
-    AirborneShots,
     Case,
     atomic_write,
     read_case,
@@ -26,6 +25,7 @@ from jaxlidar.io import (
     write_case,
     write_las_waveforms,
 )
+from jaxlidar.io.airborne import AirborneShots
 from jaxlidar.io.dem import read_grid
 from jaxlidar.io.las import read_stored_points
 from jaxlidar.io.las_header import read_header
@@ -37,6 +37,7 @@ from jaxlidar.scenes.canopy import Canopy
 from jaxlidar.scenes.scene import Scene
 from jaxlidar.scenes.voxels import VoxelMap
 from jaxlidar.spectral.waveform import Waveform
+from jaxlidar.survey.returns import DETECTORS
 from jaxlidar.survey.waveforms import Waveforms
 
 FILE_PATH = ResultPath(exists=True)
@@ -303,32 +304,14 @@ CONVERSIONS: dict[tuple[str, str], Callable[[Path, Path], None]] = {
 POINT_CONVERSIONS = {(a, b): _waveforms_to_las for a in (".nc", ".zarr") for b in (".las", ".laz")}
 
 
-class DetectorChoice(click.Choice):
-    """A detector of returns that needs no other package.
-
-    The decomposition is done by `inversion`, which this package does not import.
-    """
-
-    def convert(self, value: Any, param: Any, ctx: Any) -> Any:
-        if value == "decomposition":
-            self.fail(
-                "'decomposition' is available in Python: import inversion, and "
-                'jaxlidar.open("strip.nc").to_las("strip.laz", detector="decomposition").',
-                param,
-                ctx,
-            )
-        return super().convert(value, param, ctx)
-
-
 @click.command()
 @click.argument("source", type=FILE_PATH)
 @click.argument("target", type=click.Path(dir_okay=False, path_type=Path))
 @click.option("--crs", help="Coordinate reference system of points, such as EPSG:32633.")
 @click.option(
     "--detector",
-    type=DetectorChoice(["peak", "constant fraction", "leading edge"]),
-    help="Detector of returns, for points. Decomposition is available in Python, by to_las of the waveforms "
-    "after import inversion.  [default: peak]",
+    type=click.Choice(DETECTORS),
+    help="Detector of returns, for points.  [default: peak]",
 )
 def convert(source: Path, target: Path, crs: str | None, detector: str | None) -> None:
     """Convert a file, by the endings of both names.

@@ -1,5 +1,7 @@
 """`jaxlidar reference`."""
 
+import inspect
+import pkgutil
 import re
 import sys
 import types
@@ -27,7 +29,8 @@ PAGES = "pages"
 def reference(out: Path) -> None:
     """Build the API reference as web pages: public names by topic, and the pages of documentation.
 
-    It covers this package and those that add commands to it. Needs pdoc (pip install 'jaxlidar[docs]').
+    The classes of results follow the public names. It covers this package and those that add commands to it.
+    Needs pdoc (pip install 'jaxlidar[docs]').
 
     \b
     Example:
@@ -39,7 +42,8 @@ def reference(out: Path) -> None:
         raise click.ClickException(f"{error.name} is missing: pip install 'jaxlidar[docs]'") from None
     packages = ["jaxlidar", *(point.module for point in metadata.entry_points(group=COMMANDS))]
     packages = list(dict.fromkeys(name.partition(".")[0] for name in packages))
-    modules = {name: doc.Module.from_name(name) for name in extract.walk_specs(packages) if _is_module(name)}
+    names = [name for name in extract.walk_specs(packages) if _is_module(name)]
+    modules = {name: doc.Module(_with_classes_of_results(doc.Module.from_name(name).obj)) for name in names}
     pages = find_pages(packages)
     for name in packages:
         modules[name].docstring += _list_of_pages(pages)
@@ -68,6 +72,38 @@ def _is_module(name: str) -> bool:
     """
     package, _, member = name.rpartition(".")
     return not package or isinstance(getattr(sys.modules[package], member), types.ModuleType)
+
+
+def _with_classes_of_results(module: types.ModuleType) -> types.ModuleType:
+    """Return a module whose public names include the classes of results, which users receive by functions."""
+    if not hasattr(module, "__all__") or not hasattr(module, "__path__"):
+        return module
+    classes = classes_of_results(module)
+    page = types.ModuleType(module.__name__, module.__doc__)
+    vars(page).update({**vars(module), **classes, "__all__": [*module.__all__, *classes]})
+    return page
+
+
+def classes_of_results(package: types.ModuleType) -> dict[str, type]:
+    """Find the classes that users receive from functions, by name: they have an example, as all that users
+    see, and are no public names. Those of packages with public names of their own are left out.
+    """
+    public, classes = [getattr(package, name) for name in package.__all__], {}
+    packages = [value.__name__ + "." for value in public if hasattr(value, "__path__")]
+    public += [
+        getattr(value, name)
+        for value in public
+        if inspect.ismodule(value)
+        for name in vars(value).get("__all__", ())
+    ]
+    for info in pkgutil.walk_packages(package.__path__, package.__name__ + "."):
+        if info.name.startswith(tuple(packages)) or info.name.endswith("__main__"):
+            continue
+        for name, value in vars(pkgutil.resolve_name(info.name)).items():
+            is_defined_there = inspect.isclass(value) and value.__module__ == info.name
+            if is_defined_there and value not in public and ">>>" in (value.__doc__ or ""):
+                classes[name] = value
+    return classes
 
 
 def find_pages(packages: list[str]) -> dict[Path, str]:

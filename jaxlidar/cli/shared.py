@@ -9,7 +9,7 @@ from typing import Any
 
 import click
 
-from jaxlidar._progress import Progress, TaskProgress
+from jaxlidar._progress import Progress
 from jaxlidar.io import atomic_write
 from jaxlidar.io.store import is_zarr
 
@@ -75,9 +75,10 @@ def simulation_progress_bar(quiet: bool) -> Iterator[Callable[[Progress], None]]
         # The error falls with the square root of the number of photons, so the fraction of the work that is
         # completed is the squared ratio of the target to the current error.
         completed = 0.0
-        if progress.rtol is not None and math.isfinite(progress.error):
-            completed = (progress.rtol / max(progress.error, 1e-9)) ** 2
-        bar.set_description(f"{progress.photons:,} photons, error {progress.error:.2g}", refresh=False)
+        error = math.inf if progress.error is None else progress.error
+        if progress.rtol is not None and math.isfinite(error):
+            completed = (progress.rtol / max(error, 1e-9)) ** 2
+        bar.set_description(f"{progress.done:,} photons, error {error:.2g}", refresh=False)
         bar.n = round(100 * min(completed, 1.0))
         bar.refresh()
 
@@ -86,7 +87,7 @@ def simulation_progress_bar(quiet: bool) -> Iterator[Callable[[Progress], None]]
 
 
 @contextlib.contextmanager
-def survey_progress_bar(quiet: bool, shots: int) -> Iterator[Callable[[TaskProgress], None]]:
+def survey_progress_bar(quiet: bool, shots: int) -> Iterator[Callable[[Progress], None]]:
     """Show a progress bar for `simulate_many` on the standard error, if that is a terminal.
 
     **Returns:** a context with the function to pass as `progress=`.
@@ -96,7 +97,7 @@ def survey_progress_bar(quiet: bool, shots: int) -> Iterator[Callable[[TaskProgr
     disable = True if quiet else None
     bar = tqdm(total=shots, unit=" shots", disable=disable, file=sys.stderr, leave=False, desc="simulating")
 
-    def show(progress: TaskProgress) -> None:
+    def show(progress: Progress) -> None:
         bar.n = progress.done
         bar.refresh()
 

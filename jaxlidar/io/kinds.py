@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import numpy as np
 
-from jaxlidar._fields.checks import check_kind, concrete_array
+from jaxlidar._fields.checks import MAGNITUDES, check_kind, concrete_array
 from jaxlidar._registry import public_objects
 from jaxlidar.io.dem import DemRead, read_dem
 from jaxlidar.io.inventory import read_inventory
@@ -31,7 +31,7 @@ from jaxlidar.plants.meshes import Mesh, mesh_of, voxelise_mesh
 from jaxlidar.plants.point_canopy import PointCanopy, canopy_from_points
 from jaxlidar.plants.point_cloud import PointCloud
 from jaxlidar.plants.stand import Stand
-from jaxlidar.plants.voxelise import trim_empty_layers, voxelise, voxelise_points
+from jaxlidar.plants.voxelise import voxelise, voxelise_points
 from jaxlidar.scenes.mesh_surface import MeshInstances, MeshSurface
 from jaxlidar.scenes.surfaces import AbstractGround, AbstractSheet, Ground, Plate
 from jaxlidar.scenes.voxels import VoxelMap
@@ -50,7 +50,7 @@ _NO_KINDS = ("PhotonEvents",)
 _FUNCTIONS: tuple[Callable[..., Any], ...] = (
     *(Branching, Habit, broadleaf, conifer, shrub, spreading_tree, grow, forest),
     *(stand_of_leaf_area, stand_from_inventory, read_inventory, Stand, Stand.above, Stand.joined),
-    *(voxelise, voxelise_mesh, trim_empty_layers, Mesh, mesh_of, VoxelMap.above),
+    *(voxelise, voxelise_mesh, VoxelMap.trimmed, Mesh, mesh_of, VoxelMap.above),
     *(canopy_from_points, voxelise_points, read_las, read_qsm),
     *(VoxelMap.from_lad, VoxelMap.from_extinction, VoxelMap.from_probability),
     *(Survey.grid, Survey.track, Survey.scan, Survey.fly, read_trajectory, instrument),
@@ -58,7 +58,11 @@ _FUNCTIONS: tuple[Callable[..., Any], ...] = (
     *(spectrum, read_spectrum_csv, read_vox, read_dem, read_mesh, load_coefficients, Coefficients),
 )
 # Methods among them, with the class of their object and the name of the argument that it is.
-_METHODS = {Stand.above: (Stand, "stand"), VoxelMap.above: (VoxelMap, "voxels")}
+_METHODS = {
+    Stand.above: (Stand, "stand"),
+    VoxelMap.above: (VoxelMap, "voxels"),
+    VoxelMap.trimmed: (VoxelMap, "voxels"),
+}
 # The class of a table without `kind`, by the abstract class that is admissible.
 _DEFAULT_CLASSES = {AbstractGround: Ground, AbstractSheet: Plate}
 # The class of such a table where several are admissible.
@@ -75,12 +79,10 @@ ALTERNATIVE_ARGUMENTS = {(Lidar, "sensor")}
 DEGREES = "degrees"
 COMPASS = "degrees clockwise from north"
 UNITS = {
-    "aerosol_scale_height": "m",
+    **{name: magnitude.unit for name, magnitude in MAGNITUDES.items()},
     "alpha": DEGREES,
-    "altitude": "m",
     "angle": DEGREES,
     "angle_spread": DEGREES,
-    "aperture": "m",
     "area": "m",
     "aspect": COMPASS,
     "azimuth": COMPASS,
@@ -91,32 +93,16 @@ UNITS = {
     "bend": DEGREES,
     "bin_width": "ns",
     "bounds": "m",
-    "Cab": "ug/cm2",
-    "Cant": "ug/cm2",
-    "Car": "ug/cm2",
-    "Cc": "g/cm2",
     "clump_diameter": "m",
-    "Cm": "g/cm2",
-    "Cp": "g/cm2",
-    "Cw": "cm",
     "dead_time": "ns",
-    "decay": "ns",
     "detection_threshold": "J per sample",
-    "divergence": "mrad",
     "electronic_noise": "J per sample",
     "end": "m",
-    "energy": "J",
-    "field_of_view": "mrad",
     "frequency": "1/s",
     "gps_time": "s",
-    "fwhm": "ns",
-    "half_angle": DEGREES,
-    "height": "m",
     "heights": "m",
-    "jitter": "ns",
     "leaf_area": "m2",
     "leaf_length": "m",
-    "length": "ns",
     "lidar_ratio": "sr",
     "line_rate": "1/s",
     "max_seconds": "s",
@@ -130,11 +116,8 @@ UNITS = {
     "points": "m",
     "position": "m",
     "pitch": DEGREES,
-    "pulse_rate": "1/s",
-    "rayleigh_scale_height": "m",
     "roll": DEGREES,
     "roughness": "rad",
-    "sampling_interval": "ns",
     "scan_angle": DEGREES,
     "shift": "m",
     "saturation": "J per sample",
@@ -149,10 +132,6 @@ UNITS = {
     "stem_angle": DEGREES,
     "time": "ns",
     "tropism": DEGREES,
-    "trunk_diameter": "m",
-    "visibility": "km",
-    "voxel_size": "m",
-    "wavelength": "nm",
     "window": "ns",
     "yaw": COMPASS,
     "zenith": DEGREES,

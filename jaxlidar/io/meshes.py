@@ -48,7 +48,7 @@ class MeshRead(NamedTuple):
     **Example:**
 
     >>> import numpy as np, jaxlidar as jl
-    >>> from jaxlidar.io import MeshRead
+    >>> from jaxlidar.io.meshes import MeshRead
     >>> leaf = jl.Mesh(np.eye(3), np.array([[0, 1, 2]]))
     >>> mesh, dropped = MeshRead(leaf, {"without an area": 0})
     >>> print(f"{mesh.area.sum():.3f} m2", dropped)

@@ -150,7 +150,8 @@ class AbstractMirror(AbstractLaw):
 
     >>> import jaxlidar as jl
     >>> mirror = jl.Specular(roughness=0.0)
-    >>> isinstance(mirror, jl.AbstractMirror), mirror.largest_intensity_factor(1e-4)
+    >>> from jaxlidar.optics.laws import AbstractMirror
+    >>> isinstance(mirror, AbstractMirror), mirror.largest_intensity_factor(1e-4)
     (True, inf)
     """
 

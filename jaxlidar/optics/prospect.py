@@ -71,8 +71,10 @@ _DEFAULTS = {
     "Cc": 0.009,
 }
 
-_Spectrum = Float[Array, "*wavelengths"]
-_Batch = Float[Array, "leaves *wavelengths"]
+_Spectra = Float[Array, "*leaves_and_wavelengths"]
+# Leaves whose spectra are computed at once: their arrays fit into the processor's cache. One batch of 10,000
+# takes longer than 100 batches of 100.
+_LEAVES_AT_ONCE = 100
 
 
 @final
@@ -80,7 +82,8 @@ class Prospect(eqx.Module):
     """A leaf by the PROSPECT model: `R, T = leaf(wavelengths)` are its reflectance and transmittance.
 
     Every output is differentiable in every trait, and traits may be traced. For many leaves map over the
-    construction, e.g. `jax.vmap(lambda N, Cab: Prospect(N=N, Cab=Cab))(N, Cab)`, and see `prospect_spectra`.
+    construction, e.g. `jax.vmap(lambda N, Cab: Prospect(N=N, Cab=Cab))(N, Cab)`.
+    Called, it gives the spectra of them all.
 
     **Arguments:** all traits are single numbers. A trait of None has the value given below where the version
     has this trait, and is 0 otherwise.
@@ -189,7 +192,7 @@ class Prospect(eqx.Module):
         """
         return cls(N=3.4, Cab=20.0, Car=6.07, Cant=0.0, Cbrown=0.0, Cw=0.002, Cm=0.00463)
 
-    def __call__(self, wavelengths: ArrayLike | Sequence[ArrayLike]) -> tuple[_Spectrum, _Spectrum]:
+    def __call__(self, wavelengths: ArrayLike | Sequence[ArrayLike]) -> tuple[_Spectra, _Spectra]:
         """Hemispherical reflectance and transmittance for light within the cone of incidence `alpha`.
 
         **Arguments:**
@@ -198,13 +201,24 @@ class Prospect(eqx.Module):
           are admitted but cannot be checked: outside the table they give NaN. The surface is then computed in
           working precision.
 
-        **Returns:** reflectance and transmittance, shaped as `wavelengths`.
+        **Returns:** reflectance and transmittance, shaped as `wavelengths`; (leaves, wavelengths) of many
+        leaves, whose traits have a leading axis, as `jax.vmap` over their construction makes them. These are
+        computed in batches; call them under `jax.jit`.
 
         **Raises:** ValueError where a wavelength lies outside the table or is not a number.
+
+        **Example:** leaves of two thicknesses.
+
+        >>> import jaxlidar as jl
+        >>> import jax
+        >>> leaves = jax.vmap(lambda N: jl.Prospect(N=N))(jax.numpy.array([1.2, 2.0]))
+        >>> R, T = leaves([1064.0])
+        >>> print([f"{x:.2f}" for x in R[:, 0]], [f"{x:.2f}" for x in T[:, 0]])
+        ['0.38', '0.51'] ['0.53', '0.40']
         """
         return self._optics(wavelengths)[:2]
 
-    def absorptance(self, wavelengths: ArrayLike | Sequence[ArrayLike]) -> _Spectrum:
+    def absorptance(self, wavelengths: ArrayLike | Sequence[ArrayLike]) -> _Spectra:
         """Absorptance, 1 - R - T, accurate also for nearly transparent leaves.
 
         It is computed without subtraction.
@@ -219,7 +233,57 @@ class Prospect(eqx.Module):
         """
         return self._optics(wavelengths)[2]
 
+    def jacobian(
+        self, wavelengths: ArrayLike | Sequence[ArrayLike], batch_size: int = 20
+    ) -> tuple[tuple[_Spectra, _Spectra], dict[str, tuple[_Spectra, _Spectra]]]:
+        """Spectra of many leaves with their derivatives in every trait, at less than three times the cost.
+
+        All traits but N act through k alone, so the plate model is differentiated only twice, in k and in N.
+
+        **Arguments:**
+
+        - `wavelengths`: nm, as for calling the leaf.
+        - `batch_size`: leaves evaluated at once, an integer, at least 1. Default 20.
+
+        **Returns:** first the reflectance and transmittance, (leaves, wavelengths) each. Then a dict, by name
+        ("N" and the traits of the version), of the derivatives of these two, of the same shape, per unit of
+        the trait.
+
+        **Raises:** ValueError as for calling the leaf, for traits without an axis of leaves, and where
+        `batch_size` is no integer of at least 1.
+
+        **Example:** how reflectance at 550 nm falls with chlorophyll, per ug/cm2.
+
+        >>> import jaxlidar as jl
+        >>> import jax
+        >>> leaves = jax.vmap(lambda Cab: jl.Prospect(Cab=Cab))(jax.numpy.array([20.0, 60.0]))
+        >>> (R, T), slopes = leaves.jacobian([550.0])
+        >>> print([f"{x:.4f}" for x in slopes["Cab"][0][:, 0]])
+        ['-0.0053', '-0.0015']
+        """
+        if self.N.ndim == 0:
+            raise ValueError("N has shape (); admissible are traits of shape (leaves,), as jax.vmap makes")
+        batch_size = check_integer("batch_size", batch_size)
+        return jax.lax.map(lambda leaf: leaf._slopes(wavelengths), self, batch_size=batch_size)
+
+    def _slopes(self, wavelengths: Any) -> tuple[tuple[Array, Array], dict[str, tuple[Array, Array]]]:
+        """Spectra of one leaf, and their derivatives by the name of the trait."""
+        absorption, face = material(self, wavelengths)
+        k = self._k(absorption)
+        (R, T, _), (R_k, T_k, _), (R_N, T_N, _) = plate_model_slopes(k, self.N, face)
+        # Without this optimisation barrier the compiler would compute them again for every trait.
+        R, T, R_k, T_k, R_N, T_N = once((R, T, R_k, T_k, R_N, T_N))
+        # At constant contents dk/dN = -k/N.
+        k_over_N = k / self.N
+        slopes = {"N": (R_N - R_k * k_over_N, T_N - T_k * k_over_N)}
+        R_k, T_k = R_k / self.N, T_k / self.N
+        for name, column in zip(TRAITS[self.version], absorption):
+            slopes[name] = (R_k * column, T_k * column)
+        return (R, T), slopes
+
     def _optics(self, wavelengths: Any) -> tuple[Array, Array, Array]:
+        if self.N.ndim:
+            return jax.lax.map(lambda leaf: leaf._optics(wavelengths), self, batch_size=_LEAVES_AT_ONCE)
         absorption, face = material(self, wavelengths)
         return plate_model(self._k(absorption), self.N, face)
 
@@ -239,7 +303,7 @@ def _trait(name: str, value: ArrayLike) -> Float[Array, ""]:
     check_numbers(name, value)
     if np.size(value) != 1:
         raise ValueError(
-            f"{name} has shape {np.shape(value)}; a leaf's traits are scalars, see prospect_spectra"
+            f"{name} has shape {np.shape(value)}; a leaf's traits are scalars; jax.vmap makes many leaves"
         )
     return as_scalar(value, name)
 
@@ -280,92 +344,3 @@ def _tabulated(
     x = np.frombuffer(wavelengths).reshape(shape)
     absorption = np.stack([np.interp(x, table.wavelength, c) for c in table.absorption])
     return absorption, leaf_surface(np.interp(x, table.wavelength, table.index), alpha)
-
-
-def prospect_spectra(
-    leaves: Prospect, wavelengths: ArrayLike | Sequence[ArrayLike], batch_size: int = 100
-) -> tuple[_Batch, _Batch]:
-    """Reflectance and transmittance of many leaves, computed in batches that fit into the processor's cache.
-
-    Call it under `jax.jit`.
-
-    **Arguments:**
-
-    - `leaves`: a `Prospect` whose traits have a leading axis, all of one length, as `jax.vmap` over its
-      construction returns it.
-    - `wavelengths`: nm, as for one leaf.
-    - `batch_size`: leaves evaluated at once, an integer, at least 1. One batch of 10,000 takes longer than
-      100 batches of 100. Default 100.
-
-    **Returns:** reflectance and transmittance, (leaves, wavelengths) each.
-
-    **Raises:** ValueError as for one leaf, for a single leaf, and where `batch_size` is no integer of at
-    least 1; TypeError for leaves of another kind.
-
-    **Example:** leaves of two thicknesses.
-
-    >>> import jaxlidar as jl
-    >>> import jax
-    >>> leaves = jax.vmap(lambda N: jl.Prospect(N=N))(jax.numpy.array([1.2, 2.0]))
-    >>> R, T = jl.prospect_spectra(leaves, [1064.0])
-    >>> print([f"{x:.2f}" for x in R[:, 0]], [f"{x:.2f}" for x in T[:, 0]])
-    ['0.38', '0.51'] ['0.53', '0.40']
-    """
-    batch_size = _checked_batch_size(leaves, batch_size)
-    return jax.lax.map(lambda leaf: leaf(wavelengths), leaves, batch_size=batch_size)
-
-
-def _checked_batch_size(leaves: Prospect, batch_size: int) -> int:
-    check_kind("leaves", leaves, Prospect, "a Prospect of many leaves, as jax.vmap returns it")
-    if leaves.N.ndim == 0:
-        raise ValueError("leaves has traits of shape (); admissible are traits of shape (leaves,)")
-    return check_integer("batch_size", batch_size)
-
-
-def prospect_jacobian(
-    leaves: Prospect, wavelengths: ArrayLike | Sequence[ArrayLike], batch_size: int = 20
-) -> tuple[tuple[_Batch, _Batch], dict[str, tuple[_Batch, _Batch]]]:
-    """Spectra of many leaves with their derivatives in every trait, at less than three times the cost.
-
-    All traits but N act through k alone, so the plate model is differentiated only twice, in k and in N.
-
-    **Arguments:**
-
-    - `leaves`: a `Prospect` whose traits have a leading axis, as for `prospect_spectra`.
-    - `wavelengths`: nm, as for one leaf.
-    - `batch_size`: leaves evaluated at once, an integer, at least 1. Batches are smaller than those of
-      `prospect_spectra`, since the results are larger. Default 20.
-
-    **Returns:** first the reflectance and transmittance, (leaves, wavelengths) each. Then a dict, by name
-    ("N" and the traits of the version), of the derivatives of these two, of the same shape, per unit of the
-    trait.
-
-    **Raises:** ValueError as for one leaf, for a single leaf, and where `batch_size` is no integer of at
-    least 1; TypeError for leaves of another kind.
-
-    **Example:** how reflectance at 550 nm falls with chlorophyll, per ug/cm2.
-
-    >>> import jaxlidar as jl
-    >>> import jax
-    >>> leaves = jax.vmap(lambda Cab: jl.Prospect(Cab=Cab))(jax.numpy.array([20.0, 60.0]))
-    >>> (R, T), slopes = jl.prospect_jacobian(leaves, [550.0])
-    >>> print([f"{x:.4f}" for x in slopes["Cab"][0][:, 0]])
-    ['-0.0053', '-0.0015']
-    """
-    batch_size = _checked_batch_size(leaves, batch_size)
-
-    def spectra_and_slopes(leaf: Prospect) -> tuple[tuple[Array, Array], dict[str, tuple[Array, Array]]]:
-        absorption, face = material(leaf, wavelengths)
-        k = leaf._k(absorption)
-        (R, T, _), (R_k, T_k, _), (R_N, T_N, _) = plate_model_slopes(k, leaf.N, face)
-        # Without this optimisation barrier the compiler would compute them again for every trait.
-        R, T, R_k, T_k, R_N, T_N = once((R, T, R_k, T_k, R_N, T_N))
-        # At constant contents dk/dN = -k/N.
-        k_over_N = k / leaf.N
-        slopes = {"N": (R_N - R_k * k_over_N, T_N - T_k * k_over_N)}
-        R_k, T_k = R_k / leaf.N, T_k / leaf.N
-        for name, column in zip(TRAITS[leaf.version], absorption):
-            slopes[name] = (R_k * column, T_k * column)
-        return (R, T), slopes
-
-    return jax.lax.map(spectra_and_slopes, leaves, batch_size=batch_size)

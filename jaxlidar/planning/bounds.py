@@ -23,7 +23,7 @@ least and the largest of these numbers, F_min and F_max, wherever the leaves are
 two returns of every ray holds for the footprint: a ratio of sums lies between the least and the largest ratio
 of the summands. Plates multiply the return of what lies behind them by P^2.
 
-**Comparison.** For the measure "sum" (see `jaxlidar.Effect`) the change from S to S' is
+**Comparison.** For the measure "sum" (see `planning.effects.Effect`) the change from S to S' is
 |S - S'| / max(S, S'): 1 - S'/S where the scene gets darker without the effect, 1 - S/S' where it gets
 brighter. For "samples" it is the sum of |a_i - b_i| over that of a_i + b_i, with samples a and b.
 
@@ -83,7 +83,7 @@ class PlateFractions(NamedTuple):
 
 
 class Bounds:
-    """Bounds on what each effect changes (see `jaxlidar.Effect`) in a scene simulated up to a given order.
+    """Bounds on what each `Effect` changes in a scene simulated up to a given order.
 
     Most methods bound the effect that they are named after. Bounds are for the worst wavelength, and in
     [0, 1].

@@ -59,7 +59,8 @@ class Inventory(NamedTuple):
     **Example:**
 
     >>> import numpy as np, jaxlidar as jl
-    >>> inventory = jl.Inventory(np.array([1.0, 4.0]), np.array([2.0, 2.0]), np.array([12.0, 15.5]))
+    >>> from jaxlidar.plants.inventory import Inventory
+    >>> inventory = Inventory(np.array([1.0, 4.0]), np.array([2.0, 2.0]), np.array([12.0, 15.5]))
     >>> print(f"{inventory.height.max()} m, crowns: {inventory.crown}")
     15.5 m, crowns: None
     """

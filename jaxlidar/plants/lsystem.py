@@ -40,7 +40,8 @@ class Symbol(NamedTuple):
     **Example:**
 
     >>> import jaxlidar as jl
-    >>> print(jl.Symbol("F", (2.0, 0.1)))
+    >>> from jaxlidar.plants.lsystem import Symbol
+    >>> print(Symbol("F", (2.0, 0.1)))
     F(2,0.1)
     """
 
@@ -67,7 +68,8 @@ class Word:
     **Example:**
 
     >>> import jaxlidar as jl
-    >>> word = jl.Word.of([("F", 2.0), "[", ("+", 30.0), "J]J"])
+    >>> from jaxlidar.plants.lsystem import Word
+    >>> word = Word.of([("F", 2.0), "[", ("+", 30.0), "J]J"])
     >>> print(word, len(word), word.alphabet)
     F(2)[+(30)J]J 6 +FJ[]
     """

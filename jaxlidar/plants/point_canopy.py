@@ -82,7 +82,8 @@ class PointCanopy(NamedTuple):
 
     >>> import numpy as np, jaxlidar as jl
     >>> voxels = jl.VoxelMap.from_lad(np.full((2, 2, 5), 0.4), voxel_size=1.0)
-    >>> cloud = jl.PointCanopy(voxels, np.full((2, 2, 5), 0.1), None)
+    >>> from jaxlidar.plants.point_canopy import PointCanopy
+    >>> cloud = PointCanopy(voxels, np.full((2, 2, 5), 0.1), None)
     >>> print(cloud.density.sum(axis=2).mean())
     2.0
     """

@@ -22,12 +22,13 @@ vector v becomes, by Rodrigues' formula,
     v <- v cos(a) + (k x v) sin(a) + k (k . v) (1 - cos(a)).
 """
 
+from collections.abc import Sequence
 from math import cos, radians, sin, sqrt
 
 import numpy as np
 
 from jaxlidar._fields.checks import check_kind, check_number, check_range, check_shape
-from jaxlidar.plants.lsystem import Word
+from jaxlidar.plants.lsystem import Item, Word
 from jaxlidar.plants.tree import Tree
 
 Vector = tuple[float, float, float]
@@ -38,7 +39,7 @@ VERTICAL = 1e-9
 
 
 def turtle(
-    word: Word | str,
+    word: str | Sequence[Item] | Word,
     *,
     angle: float = 90.0,
     length: float = 1.0,
@@ -73,7 +74,8 @@ def turtle(
 
     **Arguments:**
 
-    - `word`: a `Word`, or a string of symbols without parameters.
+    - `word`: a string of symbols, a sequence of symbols with parameters in the form that `LSystem` takes, or
+      what `LSystem.rewrite` returns.
     - `angle`: angle of symbols without a parameter, degrees. Default 90.
     - `length`: length of symbols without a parameter, m. Default 1.
     - `radius`: branch radius at the start, m, positive. Default 0.01.
@@ -99,7 +101,7 @@ def turtle(
     >>> print(f"{len(tree.start)} segments; buds at heights {tree.bud_position[:, 2].round(2).tolist()} m")
     3 segments; buds at heights [3.41, 4.0] m
     """
-    check_kind("word", word, Word | str, "a Word or a string")
+    check_kind("word", word, str | Sequence | Word, "a string, or a sequence of symbols")
     word = word if isinstance(word, Word) else Word.of(word)
     check_number("angle", angle)
     check_number("length", length)

@@ -27,7 +27,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 
 from jaxlidar._fields.checks import (
     check_choice,
@@ -74,9 +74,10 @@ def voxelise(
     Where solids overlap, as branches do at joints, a voxel is at most full. The excess volume goes to the
     voxels around it, so that volumes are conserved.
 
-    A `Stand`, such as `forest` makes, is voxelised by its individuals, as `voxelise_copies` does: azimuths
-    are rounded to multiples of 22.5 degrees. To voxelise each of its trees for itself, which takes longer,
-    give them as a list.
+    A `Stand`, such as `forest` makes, is voxelised by its individuals: each one once for each azimuth, on a
+    grid whose voxels are four times smaller, which are divided among the voxels of the stand by the volumes
+    in which they overlap. Trees stand exactly at their positions; only azimuths are rounded, to multiples of
+    22.5 degrees. To voxelise each of its trees for itself, which takes longer, give them as a list.
 
     **Arguments:**
 
@@ -125,8 +126,6 @@ def voxelise(
             voxel_size,
             wood=wood,
             samples=samples,
-            offsets=_OFFSETS,
-            azimuths=_AZIMUTHS,
             origin=origin,
             shape=shape,
             progress=progress,
@@ -178,76 +177,6 @@ def _has_material(tree: Tree) -> tuple[bool, bool]:
     return len(tree.start) > 0, len(tree.bud_position) > 0
 
 
-def voxelise_copies(
-    individuals: Tree | Sequence[Tree],
-    position: Float[np.ndarray, "n 3"],
-    voxel_size: float | tuple[float, float, float],
-    *,
-    individual: Int[np.ndarray, " n"] | None = None,
-    azimuth: Float[np.ndarray, " n"] | None = None,
-    scale: Float[np.ndarray, "n 3"] | None = None,
-    leaf_area: float | Float[np.ndarray, " n"] | None = None,
-    wood: str = "volume",
-    samples: int = 8,
-    offsets: int = _OFFSETS,
-    azimuths: int = _AZIMUTHS,
-    origin: tuple[float, float, float] | None = None,
-    shape: tuple[int, int, int] | None = None,
-    progress: Callable[[int, int], None] | None = None,
-) -> VoxelMap:
-    """Voxelise a stand of many copies of a few trees.
-
-    Each individual is voxelised once per azimuth, on a grid whose voxels are `offsets` times smaller. The
-    small voxels are moved to the place of each copy, stretched by its scale, and divided among the voxels of
-    the stand by the volumes in which they overlap. Copies stand exactly at their positions; only azimuths are
-    rounded, to multiples of 360 / azimuths degrees. Volumes of wood and leaf areas are those of the copies.
-
-    **Arguments:**
-
-    - `individuals`: a `Tree`, or several.
-    - `position`: (n, 3) x, y and z in m of the `base` of each copy.
-    - `voxel_size`, `wood`, `samples`, `origin`, `shape`: as those of `voxelise`. Points are at least as close
-      as there.
-    - `individual`: (n,) integers, which of the individuals each copy is of, from 0. Default None: the first.
-    - `azimuth`: (n,) degrees by which each copy is turned clockwise. Default None: 0.
-    - `scale`: (n, 3) factors of each copy on horizontal distances from the base, on heights above it, and on
-      radii of wood, positive. Default None: 1.
-    - `leaf_area`: as that of `voxelise`: one number, or (n,) numbers, one for each copy. Default None.
-    - `offsets`: small voxels along each edge of a voxel, an integer of at least 1. Default 4.
-    - `azimuths`: azimuths that copies have, an integer of at least 1. Default 16.
-    - `progress`: a function called with the numbers of copies that are done, and of all, after each. Default
-      None.
-
-    **Returns:** a `VoxelMap`: by default the smallest grid that holds all copies.
-
-    **Raises:** as `voxelise`; ValueError for arrays of other shapes, for no copy, and for numbers of
-    individuals that there are not.
-
-    **Example:**
-
-    >>> import numpy as np, jaxlidar as jl
-    >>> shrub = jl.grow(jl.shrub(height=1.0, stems=1))
-    >>> place = np.random.default_rng(0).uniform(0.0, 30.0, (500, 3)) * [1, 1, 0]
-    >>> stand = jl.voxelise_copies(shrub, place, 0.5, leaf_area=0.001, azimuths=4)
-    >>> area = 2 * float(stand.leaf.sum()) * 0.5**3
-    >>> print(f"{area / (500 * len(shrub.bud_position)):.4f} m2 per clump")
-    0.0010 m2 per clump
-    """
-    copies = Stand(individuals, position, individual, azimuth, scale, leaf_area)
-    return _voxelise_stand(
-        copies,
-        copies.leaf_area,
-        voxel_size,
-        wood=wood,
-        samples=samples,
-        offsets=offsets,
-        azimuths=azimuths,
-        origin=origin,
-        shape=shape,
-        progress=progress,
-    )
-
-
 def _voxelise_stand(
     stand: Stand,
     leaf_area: Float[np.ndarray, " n"] | None,
@@ -255,13 +184,11 @@ def _voxelise_stand(
     *,
     wood: str,
     samples: int,
-    offsets: int,
-    azimuths: int,
     origin: tuple[float, float, float] | None,
     shape: tuple[int, int, int] | None,
     progress: Callable[[int, int], None] | None,
 ) -> VoxelMap:
-    """Voxelise a stand by its individuals; arguments as those of `voxelise_copies`.
+    """Voxelise a stand by its individuals; arguments as those of `voxelise`.
 
     1. Copies of one individual and azimuth are taken together. Its sums over small voxels are accumulated
        along the three axes (a summed-area table; Crow 1984), once for all of these copies.
@@ -271,9 +198,8 @@ def _voxelise_stand(
     """
     size = voxel_edges(voxel_size)
     check_choice("wood", wood, ("volume", "surface"))
-    samples, offsets = check_integer("samples", samples), check_integer("offsets", offsets)
-    azimuths = check_integer("azimuths", azimuths)
-    step = np.round(stand.azimuth / 360.0 * azimuths).astype(int) % azimuths
+    samples = check_integer("samples", samples)
+    step = np.round(stand.azimuth / 360.0 * _AZIMUTHS).astype(int) % _AZIMUTHS
     material = np.array([_has_material(tree) for tree in stand.individuals])[stand.individual]
     has_wood, has_leaf = bool(np.any(material[:, 0])), bool(np.any(material[:, 1]))
     if not has_wood and not has_leaf:
@@ -281,7 +207,7 @@ def _voxelise_stand(
     patterns: dict[tuple[int, int], list[int]] = {}
     for copy in np.flatnonzero(material.any(axis=1)).tolist():
         patterns.setdefault((int(stand.individual[copy]), int(step[copy])), []).append(copy)
-    turned = {(k, m): stand.individuals[k].rotated(360.0 * m / azimuths) for k, m in patterns}
+    turned = {(k, m): stand.individuals[k].rotated(360.0 * m / _AZIMUTHS) for k, m in patterns}
     # Stretching moves the box around the axes of the wood; radii and clumps around them stretch differently.
     low, high = np.full(3, np.inf), np.full(3, -np.inf)
     for key, copies in patterns.items():
@@ -292,10 +218,10 @@ def _voxelise_stand(
     sums = _MaterialSums(grid.zeros(), grid.zeros(), grid.zeros())
     n_copies = 0
     for key, copies in patterns.items():
-        fine = Grid.enclosing(*_bounding_box(turned[key]), size / offsets, None, None)
+        fine = Grid.enclosing(*_bounding_box(turned[key]), size / _OFFSETS, None, None)
         # Of one m2 in each clump, where the areas are given.
         unit_area = None if leaf_area is None else 1.0
-        amounts = _sum_material(turned[key], fine, unit_area, wood, -(-samples // offsets))
+        amounts = _sum_material(turned[key], fine, unit_area, wood, -(-samples // _OFFSETS))
         tables = [_summed_area_table(a) for a in amounts]
         factors = _amount_factors(stand, key[0], copies, leaf_area)
         for copy, amount_factors in zip(copies, factors):
@@ -303,7 +229,7 @@ def _voxelise_stand(
             # The coarse grid in small voxels of the individual: its corner and its voxels.
             corner = ((grid.low - stand.position[copy]) / stretch - fine.low) / fine.size
             faces = [
-                _faces_within(*of_axis) for of_axis in zip(corner, offsets / stretch, fine.shape, grid.shape)
+                _faces_within(*of_axis) for of_axis in zip(corner, _OFFSETS / stretch, fine.shape, grid.shape)
             ]
             target = tuple(slice(first, first + len(t) - 1) for first, t in faces)
             for total, table, factor in zip(sums, tables, amount_factors):
@@ -441,45 +367,6 @@ def voxelise_points(
         probability = np.where(wood_points > 0, wood_probability, 0.0)
         bark = VoxelMap.from_probability(bark=probability, voxel_size=size).bark
     return VoxelMap.from_lad(density, bark=bark, voxel_size=size, origin=grid.low)
-
-
-def trim_empty_layers(voxels: VoxelMap) -> VoxelMap:
-    """Trim a voxel map: without the empty layers at its sides. One voxel remains if all are empty.
-
-    **Arguments:**
-
-    - `voxels`: a `VoxelMap`.
-
-    **Returns:** a `VoxelMap` of the same voxels, smaller, with `origin` moved to its new corner.
-
-    **Raises:** TypeError for an object that is no `VoxelMap`.
-
-    **Example:**
-
-    >>> import numpy as np, jaxlidar as jl
-    >>> density = np.zeros((6, 6, 6))
-    >>> density[2:4, 1:4, 3] = 1.0
-    >>> smaller = jl.trim_empty_layers(jl.VoxelMap.from_lad(density, voxel_size=0.5))
-    >>> print(smaller.shape, smaller.origin.tolist())
-    (2, 3, 1) [1.0, 0.5, 1.5]
-    """
-    check_kind("voxels", voxels, VoxelMap, "a VoxelMap")
-    is_occupied = voxels.mean_extinction() > 0
-    if not is_occupied.any():
-        is_occupied[0, 0, 0] = True
-    ranges, first = [], []
-    for axis in range(3):
-        (layers,) = np.nonzero(is_occupied.any(axis=tuple(k for k in range(3) if k != axis)))
-        ranges.append(slice(layers[0], layers[-1] + 1))
-        first.append(layers[0])
-    occupied = tuple(ranges)
-    return VoxelMap(
-        None if voxels.leaf is None else voxels.leaf[occupied],
-        None if voxels.bark is None else voxels.bark[occupied],
-        voxels.voxel_size,
-        np.asarray(voxels.origin, float) + np.asarray(voxels.voxel_size, float) * first,
-        voxels.leaf_angles,
-    )
 
 
 def _bounding_box(tree: Tree) -> tuple[np.ndarray, np.ndarray]:

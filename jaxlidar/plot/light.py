@@ -95,7 +95,7 @@ def accuracy(steps: Sequence[Progress | Waveform], ax: Axes | None = None, **sty
     >>> import jaxlidar as jl
     >>> import jaxlidar.plot
     >>> from matplotlib.figure import Figure
-    >>> steps = [jl.Progress(8 * n, 65536 * n, 0.1 * n, 0.02 / n**0.5, 0.01) for n in (1, 2, 4)]
+    >>> steps = [jl.Progress(65536 * n, None, 0.1 * n, error=0.02 / n**0.5) for n in (1, 2, 4)]
     >>> ax = jaxlidar.plot.accuracy(steps, Figure().subplots())
     >>> print(ax.get_xlabel(), ax.get_xscale())
     photons log
@@ -103,7 +103,7 @@ def accuracy(steps: Sequence[Progress | Waveform], ax: Axes | None = None, **sty
     counts_and_errors = [
         (step.info.get("photons", 0), step.info.get("error", 0.0))
         if isinstance(step, Waveform)
-        else (step.photons, step.error)
+        else (step.done, step.error or 0.0)
         for step in steps
     ]
     # The first step may have no error yet, and a logarithmic axis shows neither zero nor infinity.

@@ -60,7 +60,7 @@ def photons(
     >>> from matplotlib.figure import Figure
     >>> wave = jl.simulate(jl.Lidar(energy=1e-9), jl.Scene(ground=jl.Ground()), key=jax.random.key(0))
     >>> counter = jl.PhotonCounter(background_rate=5e6)
-    >>> events = jl.record(wave, receiver=counter, mode="photons", key=jax.random.key(1), pulses=20)
+    >>> events = counter.count(wave, key=jax.random.key(1), pulses=20)
     >>> ax = jaxlidar.plot.photons(events, ax=Figure().subplots())
     >>> print([text.get_text() for text in ax.get_legend().get_texts()])
     ['noise', 'signal']

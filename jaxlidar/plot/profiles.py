@@ -102,7 +102,7 @@ def averaging_kernel(
 
     **Arguments:**
 
-    - `kernel`: an `inversion.AveragingKernel`, or its (layers, layers) matrix.
+    - `kernel`: what `fit.averaging_kernel` returns, or its (layers, layers) matrix.
     - `height`: (layers + 1,) edges of the layers in m, increasing. Default None: numbers of the layers.
     - `ax`: the axes to draw on. Default None: those of a new figure.
     - `style`: style of the image, as for `Axes.pcolormesh`.

@@ -125,7 +125,8 @@ class AbstractSurface(eqx.Module):
 
     >>> import jaxlidar as jl
     >>> surfaces = (jl.Ground(reflectance=0.3), jl.Plate(height=5.0, reflectance=0.4))
-    >>> [isinstance(surface, jl.AbstractSurface) for surface in surfaces]
+    >>> from jaxlidar.scenes.surfaces import AbstractSurface
+    >>> [isinstance(surface, AbstractSurface) for surface in surfaces]
     [True, True]
     """
 

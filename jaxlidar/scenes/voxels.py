@@ -224,6 +224,37 @@ class VoxelMap(eqx.Module):
         spherical = isinstance(leaf_angles, str) and leaf_angles == "spherical"
         return VoxelMap(0.5 * as_array(lad, "lad"), bark, voxel_size, origin, None if spherical else angles)
 
+    def trimmed(self) -> "VoxelMap":
+        """Trim the empty layers at the sides. One voxel remains if all are empty.
+
+        **Returns:** a `VoxelMap` of the same voxels, smaller, with `origin` moved to its new corner.
+
+        **Example:**
+
+        >>> import numpy as np, jaxlidar as jl
+        >>> density = np.zeros((6, 6, 6))
+        >>> density[2:4, 1:4, 3] = 1.0
+        >>> smaller = jl.VoxelMap.from_lad(density, voxel_size=0.5).trimmed()
+        >>> print(smaller.shape, smaller.origin.tolist())
+        (2, 3, 1) [1.0, 0.5, 1.5]
+        """
+        is_occupied = self.mean_extinction() > 0
+        if not is_occupied.any():
+            is_occupied[0, 0, 0] = True
+        ranges, first = [], []
+        for axis in range(3):
+            (layers,) = np.nonzero(is_occupied.any(axis=tuple(k for k in range(3) if k != axis)))
+            ranges.append(slice(layers[0], layers[-1] + 1))
+            first.append(layers[0])
+        occupied = tuple(ranges)
+        return VoxelMap(
+            None if self.leaf is None else self.leaf[occupied],
+            None if self.bark is None else self.bark[occupied],
+            self.voxel_size,
+            np.asarray(self.origin, float) + np.asarray(self.voxel_size, float) * first,
+            self.leaf_angles,
+        )
+
     def above(self, terrain: Terrain) -> "VoxelMap":
         """Lift the map onto a terrain, if its z is height above the ground.
 

@@ -40,13 +40,13 @@ from jaxlidar._fields.checks import (
     array,
     check_integer,
     check_key,
-    check_kind,
     check_range,
     concrete,
     kind_of,
     scalar,
 )
 from jaxlidar._fields.ranges import FRACTION, Range, check_ranges
+from jaxlidar._not_kept import check_kept
 from jaxlidar._registry import save_result
 
 # More events would exceed the memory; more arrivals could not be counted exactly in double precision.
@@ -125,6 +125,34 @@ class PhotonCounter(eqx.Module):
                     f"window = {tuple(window.tolist())} does not increase; admissible is start < end"
                 )
 
+    def count(self, wave: Any, *, key: Array, pulses: int = 1) -> "PhotonEvents":
+        """Draw the events of one or more pulses.
+
+        **Arguments:**
+
+        - `wave`: a `Waveform` or `Waveforms`. Samples that are negative by the noise of the simulation send
+          no photons.
+        - `key`: a JAX random key.
+        - `pulses`: number of pulses, each with the waveform's energy; an integer of at least 1. Default 1.
+
+        **Returns:** `PhotonEvents`: NumPy arrays, without derivatives.
+
+        **Raises:** ValueError for energies that are not finite, where negative ones take more than 1 % from a
+        waveform, and where there would be more than 10^8 events; TypeError for an object of the wrong type,
+        and within a JAX transformation.
+
+        **Example:** ten pulses over the ground.
+
+        >>> import jax
+        >>> import jaxlidar as jl
+        >>> lidar = jl.Lidar(wavelength=532.0, energy=1e-9)
+        >>> wave = jl.simulate(lidar, jl.Scene(ground=jl.Ground()), key=jax.random.key(0))
+        >>> counter = jl.PhotonCounter(background_rate=5e6)
+        >>> print(counter.count(wave, key=jax.random.key(1), pulses=10))
+        69 photon events of 1 shot with 10 pulses each: 1 of background; 8 lost to dead time
+        """
+        return _count_photons(self, wave, key, pulses)
+
 
 @final
 class PhotonEvents(eqx.Module):
@@ -147,7 +175,7 @@ class PhotonEvents(eqx.Module):
     >>> import jax, jaxlidar as jl
     >>> lidar = jl.Lidar(wavelength=532.0, energy=1e-9)
     >>> wave = jl.simulate(lidar, jl.Scene(ground=jl.Ground(height=3.0)), key=jax.random.key(0))
-    >>> events = jl.record(wave, mode="photons", key=jax.random.key(1), pulses=100)
+    >>> events = jl.PhotonCounter().count(wave, key=jax.random.key(1), pulses=100)
     >>> print(f"{len(events)} events at a mean height of {events.height.mean():.1f} m")
     694 events at a mean height of 3.0 m
     """
@@ -240,19 +268,18 @@ class _Draws(NamedTuple):
     lost: np.ndarray
 
 
-def count_photons(wave: Any, counter: Any, key: Array | None, pulses: int) -> PhotonEvents:
-    """Draw the events of `jaxlidar.record(wave, mode="photons")`.
+def _count_photons(counter: PhotonCounter, wave: Any, key: Array, pulses: int) -> PhotonEvents:
+    """Draw the events of `PhotonCounter.count`.
 
     1. Convert energies to the expected number of photons per pixel and sample, and integrate them.
     2. Draw the events of all pixels and pulses (`_draw_events`), a block of shots at a time.
     3. Add jitter, sort by shot, pulse and time, and recover shot, pulse, pixel and wavelength from the
        channel.
     """
-    check_kind("receiver", counter, PhotonCounter, "a PhotonCounter where mode = 'photons'")
     pulses = check_integer("pulses", pulses)
     check_key(key)
-    assert key is not None
     sample_time, wavelength = _concrete_field("time", wave), _concrete_field("wavelength", wave)
+    check_kept(wave.energy)
     if sample_time.size < 2:
         raise ValueError("wave has one sample; admissible are two or more, which tell how long they are")
     probability = _per_wavelength("detection_probability", counter.detection_probability, wavelength)
@@ -392,8 +419,7 @@ def _concrete_field(field: str, wave: Any) -> np.ndarray:
     """Return a field of a waveform. **Raises:** TypeError where `wave` is no waveform, or is being traced."""
     if not hasattr(wave, "energy") or (value := concrete(getattr(wave, field, None))) is None:
         raise TypeError(
-            f"wave is {kind_of(wave)}; admissible where mode = 'photons' is a Waveform or Waveforms, outside "
-            "of JAX transformations"
+            f"wave is {kind_of(wave)}; admissible is a Waveform or Waveforms, outside of JAX transformations"
         )
     return value
 

@@ -1,8 +1,7 @@
 """The receiver: detection, noise and digitisation of the energy that arrives.
 
-`record` turns expected energies per sample into a record, with or without one realisation of the noise, or
-into the events of a `PhotonCounter`. For the detected energy E of a sample, the background b and the photon
-energy e = h c / wavelength, a sample is
+`record` turns expected energies per sample into a record, with or without one realisation of the noise. For
+the detected energy E of a sample, the background b and the photon energy e = h c / wavelength, a sample is
 
     x = e Poisson((E + b) / e) + s Normal(0, 1)    (or E + b, without noise)
     x = min(x, S)                                  saturation S
@@ -14,7 +13,7 @@ energy e = h c / wavelength, a sample is
 
 import math
 from collections.abc import Callable, Sequence
-from typing import Any, ClassVar, Literal, TypeAlias, final, overload
+from typing import Any, ClassVar, TypeAlias, final
 
 import equinox as eqx
 import jax
@@ -47,9 +46,7 @@ from jaxlidar._not_kept import check_kept
 from jaxlidar.sensors.photon_counter import (
     MAX_NEGATIVE_FRACTION,
     PhotonCounter,
-    PhotonEvents,
     check_negative_energy,
-    count_photons,
 )
 
 # Above this expectation a Poisson count is drawn as a normal variable of its first three moments. The exact
@@ -120,116 +117,70 @@ class Receiver(eqx.Module):
         check_choice("window", self.window, ("fixed", "first return"))
 
 
-@overload
 def record(
     wave: Any,
     wavelength: Wavelengths | None = None,
     receiver: Receiver | None = None,
     *,
     key: Array | None = None,
-    mode: Literal["waveform"] = "waveform",
-    pulses: int = 1,
     noise_model: NoiseModel | None = None,
-) -> Float[Array, "*channels wavelengths bins"]: ...
+) -> Float[Array, "*channels wavelengths bins"]:
+    """Record a waveform with a receiver. `PhotonCounter.count` records it as photon events.
 
-
-@overload
-def record(
-    wave: Any,
-    wavelength: Wavelengths | None = None,
-    receiver: PhotonCounter | None = None,
-    *,
-    key: Array | None = None,
-    mode: Literal["photons"],
-    pulses: int = 1,
-) -> PhotonEvents: ...
-
-
-def record(
-    wave: Any,
-    wavelength: Wavelengths | None = None,
-    receiver: Receiver | PhotonCounter | None = None,
-    *,
-    key: Array | None = None,
-    mode: str = "waveform",
-    pulses: int = 1,
-    noise_model: NoiseModel | None = None,
-) -> Float[Array, "*channels wavelengths bins"] | PhotonEvents:
-    """Record a waveform with a receiver: as samples, or as photon events.
-
-    To samples, background and noise are added; saturation, detection threshold and quantisation follow in
-    this order. `jaxlidar.instrument.photon_counter` states how events are drawn.
+    Background and noise are added; saturation, detection threshold and quantisation follow in this order.
 
     **Arguments:**
 
-    - `wave`: a `Waveform` or `Waveforms`. Where `mode` is "waveform", also an array (..., wavelengths, bins)
-      of expected detected energies in J per sample, not negative. Samples of NaN stay NaN. Samples of a
-      waveform may be negative by the noise of its simulation: they send no photons.
+    - `wave`: a `Waveform` or `Waveforms`, or an array (..., wavelengths, bins) of expected detected energies
+      in J per sample, not negative. Samples of NaN stay NaN. Samples of a waveform may be negative by the
+      noise of its simulation: they send no photons.
     - `wavelength`: nm, one number or (wavelengths,), where `wave` is an array: a photon carries the energy
       h c / wavelength. Default None: the waveform's.
-    - `receiver`: the `Receiver` that records, or the `PhotonCounter` where `mode` is "photons". Default None:
-      one with its defaults.
-    - `key`: a JAX random key. Photon events need one. With a key, samples are one realisation of the noise:
-      the photons of signal and background are Poisson counts, or a normal variable of mean, variance and
-      skewness of a Poisson count where more than 10,000 are expected; electronic noise is normal. Default
-      None: the samples of the expected energies, without noise.
-    - `mode`: "waveform" for samples or "photons" for events. Default "waveform".
-    - `pulses`: number of pulses, each with the waveform's energy, whose events are drawn; an integer of at
-      least 1. Default 1, the only admissible one for samples.
+    - `receiver`: the `Receiver` that records. Default None: one with its defaults.
+    - `key`: a JAX random key. With a key, samples are one realisation of the noise: the photons of signal and
+      background are Poisson counts, or a normal variable of mean, variance and skewness of a Poisson count
+      where more than 10,000 are expected; electronic noise is normal. Default None: the samples of the
+      expected energies, without noise.
     - `noise_model`: a function of `key`, the expected energies with the background, (..., wavelengths, bins)
       J, and the wavelengths in nm, (..., wavelengths, 1), which broadcast with them, that returns the noisy
       samples, of the shape of the energies, in place of the receiver's photon and electronic noise.
       Saturation, threshold and quantisation follow. Where JAX traces the energies it is to be traceable,
       otherwise NumPy will do. Default None: those of the receiver.
 
-    **Returns:** J per sample, an array shaped as the energies; or `PhotonEvents`. Derivatives of samples pass
-    through the quantisation as if it were absent (a straight-through estimate). They pass through the noise
-    of a realisation with its draws held fixed, so not through Poisson counts. Events are NumPy arrays,
-    without derivatives.
+    **Returns:** J per sample, an array shaped as the energies. Derivatives pass through the quantisation as
+    if it were absent (a straight-through estimate). They pass through the noise of a realisation with its
+    draws held fixed, so not through Poisson counts.
 
     **Raises:** ValueError where the energies have fewer than two axes, for infinite energies, for negative
     ones in an array, and where those of a waveform take more than 1 % from it; for wavelengths that are not
-    positive, and for neither one nor one per row of the energies; for a noise model without a key, with
-    `mode` "photons", or that returns another shape than that of the energies; for events, also for energies
-    of NaN, and where there would be more than 10^8; TypeError for an object of the wrong type. Inside a JAX
+    positive, and for neither one nor one per row of the energies; for a noise model without a key, or that
+    returns another shape than that of the energies; TypeError for an object of the wrong type. Inside a JAX
     transformation, where values cannot be refused, such samples become NaN: the negative or infinite ones of
     an array, all of a waveform.
 
-    **Example:** samples, and the events of ten pulses over the same ground.
+    **Example:**
 
-    >>> import jax
     >>> import jaxlidar as jl
     >>> import numpy as np
     >>> receiver = jl.Receiver(detection_threshold=3e-16, saturation=1e-15)
     >>> recorded = jl.record(np.array([[2e-16, 6e-16, 17e-16]]), 1064.0, receiver)
     >>> print([f"{x:.1e}" for x in recorded[0]])
     ['0.0e+00', '6.0e-16', '1.0e-15']
-    >>> lidar = jl.Lidar(wavelength=532.0, energy=1e-9)
-    >>> wave = jl.simulate(lidar, jl.Scene(ground=jl.Ground()), key=jax.random.key(0))
-    >>> counter = jl.PhotonCounter(background_rate=5e6)
-    >>> print(jl.record(wave, receiver=counter, mode="photons", key=jax.random.key(1), pulses=10))
-    69 photon events of 1 shot with 10 pulses each: 1 of background; 8 lost to dead time
     """
-    check_choice("mode", mode, ("waveform", "photons"))
     check_kind("noise_model", noise_model, Callable | None, "a function, or None")
-    if noise_model is not None and (key is None or mode == "photons"):
-        raise ValueError("noise_model is given; admissible is one with a key, where mode = 'waveform'")
+    if noise_model is not None and key is None:
+        raise ValueError("noise_model is given; admissible is one with a key")
     is_waveform = hasattr(wave, "energy")
     if is_waveform and wavelength is not None:
         raise ValueError("wavelength is given, but wave is a waveform, which has its own")
     if is_waveform:
         check_kept(wave.energy)
-    if mode == "photons":
-        return count_photons(wave, PhotonCounter() if receiver is None else receiver, key, pulses)
-    if check_integer("pulses", pulses) != 1:
-        raise ValueError(f"pulses = {pulses}; admissible is 1 where mode = 'waveform'")
     energies: Any = wave.energy if is_waveform else wave
     wavelengths: Any = wave.wavelength if is_waveform else wavelength
     check_numbers("wavelength", wavelengths)
     energy, wavelength = as_array(energies, "energy"), as_array(wavelengths, "wavelength")
     receiver = Receiver() if receiver is None else receiver
-    check_kind("receiver", receiver, Receiver, "a Receiver where mode = 'waveform'")
-    assert isinstance(receiver, Receiver)
+    check_kind("receiver", receiver, Receiver, "a Receiver; a PhotonCounter counts by its method count")
     if energy.ndim < 2:
         raise ValueError(f"energy has shape {energy.shape}; admissible is (..., wavelengths, bins)")
     check_range("wavelength", wavelength, 0.0, low_open=True)

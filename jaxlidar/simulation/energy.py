@@ -150,8 +150,9 @@ def energy_budget(
 
         def report(errors: HasErrors) -> None:
             if progress is not None:
-                batches, seconds = estimate.n_batches, time.perf_counter() - start_time
-                progress(Progress(batches, batches * PHOTONS_PER_BATCH, seconds, errors.relative, rtol))
+                photons = estimate.n_batches * PHOTONS_PER_BATCH
+                seconds = time.perf_counter() - start_time
+                progress(Progress(photons, None, seconds, "photons", error=errors.relative, rtol=rtol))
 
         stop = StoppingRule(rtol, min_size=MIN_BATCHES, max_size=-(-max_photons // PHOTONS_PER_BATCH))
         reason, errors = sample_until(estimate, stop, BATCH_STEPS, report=report, keeps_interrupted=True)

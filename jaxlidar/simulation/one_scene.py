@@ -453,9 +453,9 @@ def _trace_batches(
 
         def report(errors: HasErrors) -> None:
             if progress is not None:
-                batches, seconds = estimate.n_batches, time.perf_counter() - start_time
-                photons = batches * plan.photons_traced
-                progress(Progress(batches, photons, seconds, errors.relative, stop.rtol))
+                photons = estimate.n_batches * plan.photons_traced
+                seconds = time.perf_counter() - start_time
+                progress(Progress(photons, None, seconds, "photons", error=errors.relative, rtol=stop.rtol))
 
         reason, errors = sample_until(
             estimate,

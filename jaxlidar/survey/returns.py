@@ -10,7 +10,7 @@ With the sample times t_j and a record y(t) in J per sample, less its background
 - **leading edge**: a return begins when the record rises through the threshold, and ends when it falls
   below half of that. Its time is that of the crossing.
 - **decomposition**: the record is fitted by copies of the pulse, which may be broadened
-  (`inversion.gaussian_decomposition`).
+  (`jaxlidar.survey.decomposition`).
 - **a function of one's own** gives the times of the returns of each record. Amplitude, width and extent of a
   return are those about the largest sample among those that are nearer to its time than to another return's,
   and no farther from it than the pulse is long.
@@ -55,8 +55,7 @@ from jaxlidar._fields.checks import (
     check_range,
 )
 from jaxlidar._not_kept import NotKept
-from jaxlidar._progress import TaskProgress
-from jaxlidar._registry import decompose_records
+from jaxlidar._progress import Progress
 from jaxlidar.io.airborne import AirborneShot, Returns, Segment
 from jaxlidar.io.las import write_las
 from jaxlidar.sensors.lidar import Lidar
@@ -77,7 +76,7 @@ _RELATIVE_FLOOR = 1e-3
 _HYSTERESIS = 0.5
 # Samples below this fraction of the level that is crossed are raised to it before logarithms are taken.
 _LOGARITHM_FLOOR = 0.01
-# Background of noisy records: samples above the median by so many standard deviations are echoes; the
+# Background of noisy records: samples above the median by this many standard deviations are echoes; the
 # fraction of a normal distribution one standard deviation or more below its median; most rounds.
 _CLIPPING, _ONE_SIGMA_BELOW, _MAX_CLIPPINGS = 3.0, 0.15866, 20
 # Relative differences of the samples of a plateau: rounding, and the range, by which energy falls.
@@ -792,7 +791,7 @@ def returns_of(
     threshold: Any = None,
     fraction: Any = 0.5,
     max_returns: int | None = None,
-    progress: Callable[[TaskProgress], None] | None = None,
+    progress: Callable[[Progress], None] | None = None,
 ) -> DiscreteReturns:
     """Detect the returns of waveforms. Arguments are those of `Waveforms.returns`."""
     if not callable(detector):
@@ -820,7 +819,7 @@ def returns_of(
         else:
             blocks.append(_detect_chunk(waves, records[shots], shots, settings, is_own_record))
         if progress is not None:
-            progress(TaskProgress(shots.stop, len(waves), time.perf_counter() - start_time))
+            progress(Progress(shots.stop, len(waves), time.perf_counter() - start_time))
     echoes = {name: np.concatenate([block[name] for block in blocks]) for name in blocks[0]}
     return _assemble(waves, echoes, max_returns)
 
@@ -1062,9 +1061,13 @@ def _decompose_windows(
     noise[:, 0] = 1.0
     for k, (row, start, end) in enumerate(windows):
         power[k, : end - start], noise[k, : end - start] = record[row, start:end], sigma[row, start:end]
-    fitted = decompose_records(np.arange(float(length)), power, noise, pulse)
+    # optimistix, which fits, takes a second to import: only for those who decompose.
+    from jaxlidar.survey.decomposition import gaussian_decomposition
+
+    fitted = gaussian_decomposition(np.arange(float(length)), power, noise=noise, pulse=pulse)
+    echoes = fitted.count, fitted.amplitude, fitted.time, fitted.width
     rows, starts, ends = (np.array(column) for column in zip(*windows))
-    count, amplitude, time, std = (np.asarray(a, float)[: len(windows)] for a in fitted)
+    count, amplitude, time, std = (np.asarray(a, float)[: len(windows)] for a in echoes)
     # Broadened by a Gaussian, a copy of the pulse is lower by the ratio of the widths.
     pulse_std = pulse.sum() / (np.sqrt(2.0 * np.pi) * pulse.max())
     height = amplitude * pulse_std / np.hypot(pulse_std, std)

@@ -31,7 +31,7 @@ from jaxlidar._fields.checks import (
 )
 from jaxlidar._fingerprint import fingerprint
 from jaxlidar._jax.workers import WorkUnit, outcomes
-from jaxlidar._progress import TaskProgress
+from jaxlidar._progress import Progress
 from jaxlidar._registry import simulate_survey
 from jaxlidar.io.case import Case, case_text
 from jaxlidar.io.store import check_store_path, open_store
@@ -59,7 +59,7 @@ def simulate_many(
     path: str | os.PathLike[str] | None = None,
     executor: Executor | None = None,
     mesh: jax.sharding.Mesh | None = None,
-    progress: Callable[[TaskProgress], None] | None = None,
+    progress: Callable[[Progress], None] | None = None,
     shared: bool | None = None,
     truth: bool = False,
     keep: Collection[str] | None = None,
@@ -108,7 +108,7 @@ def simulate_many(
       worker dies gets a second try. Default None: this process, on all cores.
     - `mesh`: a `jax.sharding.Mesh`, whose devices do tasks: each takes the next one. A program is compiled
       for each device. Default None: the default device.
-    - `progress`: a function called with a `TaskProgress` after every task; for instance `print`. Default
+    - `progress`: a function called with a `Progress` after every task; for instance `print`. Default
       None.
     - `shared`: True traces with shared illumination, and refuses shots that cannot share light; False traces
       per shot. Default None: shared where it is possible and saves time.
@@ -276,7 +276,7 @@ def _trace(
     results: SurveyResults,
     key: PRNGKeyArray,
     run_tasks: Callable[[list[WorkUnit]], Iterator[tuple[WorkUnit, Any]]],
-    progress: Callable[[TaskProgress], None] | None,
+    progress: Callable[[Progress], None] | None,
 ) -> None:
     """Run the tasks without a result yet, until the results of all shots are there."""
     tasks, shots = results.strategy.tasks(key), len(results.strategy.survey)
@@ -289,5 +289,5 @@ def _trace(
         n_done += 1
         if progress is not None:
             seconds = time.perf_counter() - start_time
-            progress(TaskProgress(shots * n_done // len(tasks), shots, seconds, stored=stored))
+            progress(Progress(shots * n_done // len(tasks), shots, seconds, stored=stored))
     results.sum_contributions()

@@ -12,7 +12,7 @@ from jaxtyping import ArrayLike, Float, Int
 from jaxlidar._constants import SPEED_OF_LIGHT
 from jaxlidar._fields.checks import check_index, check_numbers
 from jaxlidar._not_kept import NotKept
-from jaxlidar._progress import TaskProgress
+from jaxlidar._progress import Progress
 from jaxlidar._registry import detect_returns, true_returns
 from jaxlidar._summary import NOTABLE_FRACTION, percent
 from jaxlidar.io import netcdf
@@ -219,7 +219,7 @@ class Waveforms(eqx.Module):
         threshold: ArrayLike | None = None,
         fraction: ArrayLike = 0.5,
         max_returns: int | None = None,
-        progress: Callable[[TaskProgress], None] | None = None,
+        progress: Callable[[Progress], None] | None = None,
     ) -> DiscreteReturns:
         """Detect the discrete returns of all shots, as a laser scanner reports them.
 
@@ -230,7 +230,7 @@ class Waveforms(eqx.Module):
         **Arguments:**
 
         - `detector`: "peak", "constant fraction" or "leading edge"; or "decomposition" into echoes of the
-          pulse's shape, which needs `import inversion` and some milliseconds per shot; or a function of one
+          pulse's shape, which takes some milliseconds per shot; or a function of one
           record's times in ns, samples in J without background, and their noise, NumPy arrays of
           (samples,). It gives the times of the returns in ns, (returns,), a sample or more apart. NaN
           stands for no return, so that compiled functions can give as many times for every record. Times
@@ -249,15 +249,14 @@ class Waveforms(eqx.Module):
           and 1 % of the shot's largest sample. A function applies its own: None alone is admissible.
         - `fraction`: level of "constant fraction" on the leading edge, over the amplitude, in (0, 1).
           Default 0.5.
-        - `max_returns`: of a shot with more, the strongest so many are returned. Default None: all.
-        - `progress`: a function called with a `TaskProgress` after every few thousand shots. Default None.
+        - `max_returns`: the strongest returns of a shot that has more. Default None: all.
+        - `progress`: a function called with a `Progress` after every few thousand shots. Default None.
 
         **Returns:** a `DiscreteReturns`.
 
         **Raises:** ValueError for arguments outside their ranges or of other shapes, for waveforms of a
         file of an earlier version, and for times that a function gives outside of the record or in another
-          shape; TypeError for a detector that is neither a name nor a function; RuntimeError for
-          "decomposition" where `inversion` is not imported.
+          shape; TypeError for a detector that is neither a name nor a function.
 
         **Example:**
 

@@ -186,7 +186,7 @@ def test_echoes_decide_which_scene_is_fitted(example, tmp_path, monkeypatch, cap
 
     monkeypatch.setattr(module, "fit", fit)
     good = inversion.Verdict("good", ())
-    monkeypatch.setattr(inversion, "judge_fits", lambda fits, about: (good,) * len(fits.status))
+    monkeypatch.setattr(inversion, "judge_fit", lambda fits, about: (good,) * len(fits.status))
     quiet = np.full(120, 20, np.uint16)
     records = echo([(60, 100)]), echo([(30, 50), (60, 100)]), quiet, echo([(60, 100)], broadening=3.0)
     arguments = [str(las_of(tmp_path, *records)), "--pulse-width", str(FWHM), "--out", str(tmp_path / "out")]

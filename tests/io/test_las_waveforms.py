@@ -10,7 +10,6 @@ import pytest
 
 from jaxlidar.io import (
     AirborneShot,
-    Returns,
     Segment,
     read_las,
     read_las_waveforms,
@@ -18,6 +17,7 @@ from jaxlidar.io import (
     write_las,
     write_las_waveforms,
 )
+from jaxlidar.io.airborne import Returns
 from tests.helpers import slow_unless
 
 # A NaN whose bits signal an error: NumPy warns where it is cast.

@@ -5,7 +5,8 @@ import csv
 import numpy as np
 import pytest
 
-from jaxlidar.io import Column, ColumnAxis, ShotTable
+from jaxlidar.io import Column, ShotTable
+from jaxlidar.io.tables import ColumnAxis
 
 LEVELS = ColumnAxis("percentile", np.array([50.0, 98.0]), "percent")
 

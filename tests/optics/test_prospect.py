@@ -12,7 +12,7 @@ from scipy.optimize import brentq
 from jaxlidar.optics.coefficients import TRAITS, load_coefficients, shipped
 from jaxlidar.optics.leaf_surface import leaf_surface
 from jaxlidar.optics.plate_model import plate_model
-from jaxlidar.optics.prospect import Prospect, prospect_jacobian, prospect_spectra
+from jaxlidar.optics.prospect import Prospect
 from tests.helpers import slow_unless
 
 WAVELENGTHS = np.arange(400.0, 2501.0)
@@ -158,8 +158,8 @@ def random_leaves(n):
 @pytest.mark.slow
 def test_batches(precision):
     leaves, wavelengths = random_leaves(7), np.array([450.0, 700.5, 1550.0])
-    R, T = jax.jit(lambda leaves: prospect_spectra(leaves, wavelengths, batch_size=3))(leaves)
-    jacobian = jax.jit(lambda leaves: prospect_jacobian(leaves, wavelengths, batch_size=3))
+    R, T = jax.jit(lambda leaves: leaves(wavelengths))(leaves)
+    jacobian = jax.jit(lambda leaves: leaves.jacobian(wavelengths, batch_size=3))
     values, slopes = jacobian(leaves)
     tolerance = 20 * float(np.finfo(precision).eps)
     np.testing.assert_allclose(values, (R, T), rtol=tolerance)
@@ -276,7 +276,7 @@ def test_wavelengths_refused(wavelengths):
 
 def test_batch_size_refused():
     with pytest.raises(ValueError, match="batch_size = 0"):
-        prospect_spectra(random_leaves(2), LASERS, batch_size=0)
+        random_leaves(2).jacobian(LASERS, batch_size=0)
 
 
 @pytest.mark.parametrize("version", ["4", "5", "D", "PC"])

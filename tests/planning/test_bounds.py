@@ -135,7 +135,7 @@ FAST_CASES = (
 
 
 def relative_change(with_, without_, measure):
-    """Return the change that `jaxlidar.Effect` bounds."""
+    """Return the change that `jaxlidar.planning.effects.Effect` bounds."""
     with_samples, without_samples = (np.asarray(w.reflectance, float) for w in (with_, without_))
     sums = with_samples.sum(axis=1), without_samples.sum(axis=1)
     if measure == "sum":

@@ -5,6 +5,7 @@ import pytest
 from scipy import stats
 
 import jaxlidar as jl
+from jaxlidar.plants.lsystem import Symbol, Word
 
 ALGAE = [jl.Rule("A", lambda: "AB"), jl.Rule("B", lambda: "A")]
 
@@ -22,9 +23,9 @@ def test_a_symbol_may_vanish():
 
 
 def test_words_hold_symbols():
-    word = jl.Word.of(["AB", ("F", 1, 2.5), "[", "]"])
+    word = Word.of(["AB", ("F", 1, 2.5), "[", "]"])
     assert str(word) == "ABF(1,2.5)[]"
-    assert list(word)[1:3] == [jl.Symbol("B"), jl.Symbol("F", (1.0, 2.5))]
+    assert list(word)[1:3] == [Symbol("B"), Symbol("F", (1.0, 2.5))]
     assert word.alphabet == "ABF[]"
     assert word.where("F").tolist() == [2]
 
@@ -144,7 +145,7 @@ def test_tropism_bends_in_proportion_to_the_sine():
     zenith = np.deg2rad(30)
     heading = (np.sin(zenith), 0, np.cos(zenith))
     for angle in (20.0, -20.0):
-        word = jl.Word.of([("T", angle), "F"])
+        word = Word.of([("T", angle), "F"])
         tree = jl.turtle(word, heading=heading, left=(0, 1, 0))
         bent = np.arctan2(tree.end[0, 0], tree.end[0, 2])
         assert np.isclose(np.rad2deg(bent), 30 - 0.5 * angle)
@@ -152,13 +153,13 @@ def test_tropism_bends_in_proportion_to_the_sine():
 
 
 def test_rolling_to_the_horizontal():
-    tree = jl.turtle(jl.Word.of([("/", 77), "$", ("+", 90), "F"]), heading=(1, 0, 1), left=(0, 1, 0))
+    tree = jl.turtle([("/", 77), "$", ("+", 90), "F"], heading=(1, 0, 1), left=(0, 1, 0))
     assert np.allclose(tree.end, [[0, 1, 0]])
     assert np.allclose(jl.turtle("$F").end, [[0, 0, 1]])
 
 
 def test_segments_buds_parents_and_orders():
-    word = jl.Word.of(
+    word = Word.of(
         [("F", 2, 0.2), "[", ("+", 90), ("F", 1, 0.1, 0.05), "FJ]X", ("f", 1), ("!", 0.03), "F", ("J", 0.07)]
     )
     tree = jl.turtle(word, position=(0, 0, 5), heading=(0, 0, 1), left=(1, 0, 0))
@@ -180,8 +181,8 @@ def test_empty_words_are_trees_without_segments():
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (lambda: jl.Word.of([("AB", 1)]), "symbol in the word = 'AB' is not one character"),
-        (lambda: jl.Word.of([("A", np.nan)]), "parameter 1 of 'A' in the word = nan is outside"),
+        (lambda: Word.of([("AB", 1)]), "symbol in the word = 'AB' is not one character"),
+        (lambda: Word.of([("A", np.nan)]), "parameter 1 of 'A' in the word = nan is outside"),
         (lambda: jl.Rule("AB", lambda: "A"), "symbol = 'AB' is not one character"),
         (lambda: jl.Rule("A", lambda: "A", weight=0.0), "weight = 0 is outside"),
         (lambda: jl.LSystem("A", ALGAE).rewrite(-1), "steps = -1 is outside"),
@@ -206,7 +207,7 @@ def test_empty_words_are_trees_without_segments():
         (lambda: jl.turtle("F", angle=np.nan), "angle = nan is outside"),
         (lambda: jl.turtle("F", heading=(0, 0, 0)), "length of heading = 0 is outside"),
         (lambda: jl.turtle("F", heading=(1, 0, 0), left=(2, 0, 0)), "left = .* is along the heading"),
-        (lambda: jl.turtle(jl.Word.of([("F", 1, -0.1)])), "radius_start = -0.1 is outside"),
+        (lambda: jl.turtle([("F", 1, -0.1)]), "radius_start = -0.1 is outside"),
     ],
 )
 def test_inadmissible_input_is_refused(call, message):

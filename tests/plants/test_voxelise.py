@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import jaxlidar as jl
-from jaxlidar import Tree, trim_empty_layers, voxelise, voxelise_points
+from jaxlidar import Tree, voxelise, voxelise_points
 
 NO_POSITIONS = np.zeros((0, 3))
 
@@ -168,11 +168,11 @@ def test_empty_layers_are_trimmed():
     voxels = jl.VoxelMap.from_extinction(
         leaf=k, bark=0 * k, voxel_size=(1.0, 2.0, 3.0), origin=(10.0, 0.0, -3.0)
     )
-    trimmed = trim_empty_layers(voxels)
+    trimmed = voxels.trimmed()
     assert trimmed.shape == (3, 1, 3)
     np.testing.assert_allclose(trimmed.origin, [11.0, 4.0, 6.0])
     np.testing.assert_allclose(trimmed.leaf, k[1:4, 2:3, 3:6])
-    assert trim_empty_layers(jl.VoxelMap.from_extinction(leaf=0 * k, voxel_size=1.0)).shape == (1, 1, 1)
+    assert jl.VoxelMap.from_extinction(leaf=0 * k, voxel_size=1.0).trimmed().shape == (1, 1, 1)
 
 
 def test_points_divide_the_leaf_area():
@@ -240,33 +240,32 @@ def test_copies_on_the_nodes_of_the_fine_grid_are_those_of_direct_voxelisation()
     place = np.round(random.uniform(0.0, 6.0, (12, 3)) * [1, 1, 0] / 0.125) * 0.125
     azimuth = 90.0 * (np.arange(12) % 4)
     how = {"leaf_area": 0.001, "wood": "surface"}
-    copies = jl.voxelise_copies(shrub, place, 0.5, azimuth=azimuth, azimuths=4, **how)
+    copies = jl.voxelise(jl.Stand(shrub, place, azimuth=azimuth), 0.5, **how)
     trees = [shrub.translated(-shrub.base).rotated(a).translated(p) for p, a in zip(place, azimuth)]
     direct = jl.voxelise(trees, 0.5, **how)
     np.testing.assert_array_equal(copies.origin, direct.origin)
     np.testing.assert_allclose(copies.leaf, direct.leaf, rtol=1e-5, atol=1e-6)
     # Points on wood differ, as the fine grid is aligned with the copy.
     assert np.allclose(copies.bark.sum(), direct.bark.sum(), rtol=1e-4)
-    shifted = jl.voxelise_copies(
-        shrub, np.add(place, (5e5 + 0.03, 5.2e6 - 0.04, 0.0)), 0.5, azimuth=17.0 + azimuth, **how
-    )
+    far = np.add(place, (5e5 + 0.03, 5.2e6 - 0.04, 0.0))
+    shifted = jl.voxelise(jl.Stand(shrub, far, azimuth=17.0 + azimuth), 0.5, **how)
     area = 2.0 * float(np.asarray(shifted.leaf, float).sum()) * 0.5**3
     assert np.isclose(area, 12 * 0.001 * len(shrub.bud_position), rtol=1e-5)
     # A copy that is moved by a voxel is another map.
-    other = jl.voxelise_copies(shrub, np.add(place, (0.125, 0, 0)), 0.5, azimuth=azimuth, azimuths=4, **how)
+    other = jl.voxelise(jl.Stand(shrub, np.add(place, (0.125, 0, 0)), azimuth=azimuth), 0.5, **how)
     assert other.shape != direct.shape or not np.allclose(other.leaf, direct.leaf)
 
 
 def test_copies_of_several_individuals_and_refused_arguments():
     small, tall = (jl.grow(jl.shrub(height=h, stems=1)) for h in (1.0, 2.0))
     place = np.array([[0.0, 0.0, 0.0], [4.0, 0.0, 0.0]])
-    stand = jl.voxelise_copies([small, tall], place, 0.5, individual=np.array([1, 0]), leaf_area=0.001)
+    stand = jl.voxelise(jl.Stand([small, tall], place, np.array([1, 0])), 0.5, leaf_area=0.001)
     area = 2.0 * float(np.asarray(stand.leaf, float).sum()) * 0.5**3
     assert np.isclose(area, 0.001 * (len(small.bud_position) + len(tall.bud_position)), rtol=1e-5)
     assert float(stand.top[2]) >= tall.height
     with pytest.raises(ValueError, match=r"individual = 2 is outside the admissible range \[0, 1\]"):
-        jl.voxelise_copies([small, tall], place, 0.5, individual=np.array([2, 0]))
+        jl.Stand([small, tall], place, np.array([2, 0]))
     with pytest.raises(ValueError, match=r"position has shape \(0, 3\)"):
-        jl.voxelise_copies(small, np.zeros((0, 3)), 0.5)
+        jl.Stand(small, np.zeros((0, 3)))
     with pytest.raises(ValueError, match="individuals is empty"):
-        jl.voxelise_copies([], place, 0.5)
+        jl.Stand([], place)

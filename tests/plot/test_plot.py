@@ -8,6 +8,7 @@ from matplotlib.figure import Figure
 
 import jaxlidar as jl
 from jaxlidar import plot
+from jaxlidar.io.icesat2 import PhotonTrack
 from jaxlidar.plot.style import check_waveform
 
 matplotlib.use("agg")
@@ -224,7 +225,7 @@ def test_the_energy_budget_adds_up_to_100_percent(wave, axes):
 
 
 def test_accuracy_has_the_error_and_the_target(wave, axes):
-    steps = [jl.Progress(8 * n, 65536 * n, 0.1 * n, 0.02 / n**0.5, 0.01) for n in (4, 1)]
+    steps = [jl.Progress(65536 * n, None, 0.1 * n, "photons", error=0.02 / n**0.5, rtol=0.01) for n in (4, 1)]
     assert plot.accuracy(steps, axes) is axes
     lines = lines_of(axes)
     assert np.allclose(lines["relative error"], [[65536, 0.02], [262144, 0.01]])
@@ -266,7 +267,7 @@ def test_fit_shows_data_model_and_residuals(wave):
 def test_photons_are_drawn_at_their_heights_in_the_colours_of_their_labels(axes):
     wave = jl.simulate(jl.Lidar(energy=1e-9), jl.Scene(ground=jl.Ground(height=2.0)), key=jax.random.key(0))
     sun = jl.PhotonCounter(background_rate=1e7)
-    events = jl.record(wave, receiver=sun, mode="photons", key=jax.random.key(1), pulses=50)
+    events = sun.count(wave, key=jax.random.key(1), pulses=50)
     assert plot.photons(events, ax=axes) is axes
     lines = lines_of(axes)
     assert np.array_equal(lines["signal"][:, 1], events.height[events.signal])
@@ -296,7 +297,7 @@ def test_a_recorded_track_is_drawn_about_its_ground(axes):
     n = 50
     zero, one = np.zeros(n), np.zeros(1)
     height = np.r_[np.full(25, 100.0), np.linspace(-200.0, 300.0, 25)]
-    track = jl.io.PhotonTrack(
+    track = PhotonTrack(
         beam="gt1r",
         distance=np.arange(float(n)),
         height=height,

@@ -50,7 +50,7 @@ def test_atlas_counts_the_published_photons_of_winter_ice(name, published):
     photons = float(wave.energy.sum()) * 532e-9 / PLANCK_TIMES_LIGHT
     assert photons == pytest.approx(published, rel=0.1)
     # The counter loses a few to dead time; 4,000 pulses give the mean to 1 %.
-    events = jl.record(wave, receiver=lidar.receiver, mode="photons", key=jax.random.key(1), pulses=4000)
+    events = lidar.receiver.count(wave, key=jax.random.key(1), pulses=4000)
     arrived = (len(events) + int(events.lost.sum())) / 4000
     assert abs(arrived - photons) < 3 * np.sqrt(photons / 4000)
     # The planted wrong answer: a strong beam's energy in a weak one.

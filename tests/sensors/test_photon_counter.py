@@ -58,9 +58,7 @@ def dark(bins=10):
 
 
 def events_of(wave, pulses, seed=0, **fields):
-    return jl.record(
-        wave, receiver=jl.PhotonCounter(**fields), mode="photons", key=jax.random.key(seed), pulses=pulses
-    )
+    return jl.PhotonCounter(**fields).count(wave, key=jax.random.key(seed), pulses=pulses)
 
 
 def z_of_mean(values, expected):
@@ -295,34 +293,24 @@ def test_inadmissible_counters_are_refused(fields, message):
 
 
 def test_inadmissible_records_are_refused():
-    wave, key = dark(), jax.random.key(0)
-    with pytest.raises(TypeError, match="key is None; admissible is a JAX random key"):
-        jl.record(wave, mode="photons")
-    with pytest.raises(TypeError, match="receiver is a Receiver; admissible is a PhotonCounter where mode"):
-        jl.record(wave, receiver=jl.Receiver(), mode="photons", key=key)
-    with pytest.raises(TypeError, match="receiver is a PhotonCounter; admissible is a Receiver where mode"):
-        jl.record(wave, receiver=jl.PhotonCounter())
-    with pytest.raises(ValueError, match="mode = 'photon' is none of 'waveform', 'photons'"):
-        jl.record(wave, mode="photon", key=key)
+    wave, key, count = dark(), jax.random.key(0), jl.PhotonCounter().count
     with pytest.raises(ValueError, match="pulses = 0"):
-        jl.record(wave, mode="photons", key=key, pulses=0)
-    with pytest.raises(ValueError, match="pulses = 2; admissible is 1 where mode = 'waveform'"):
-        jl.record(wave, pulses=2)
+        count(wave, key=key, pulses=0)
     with pytest.raises(ValueError, match="wavelength is given, but wave is a waveform"):
-        jl.record(wave, GREEN, mode="photons", key=key)
+        jl.record(wave, GREEN, key=key)
     with pytest.raises(TypeError, match="wavelength is None; admissible are real numbers"):
         jl.record(np.ones((1, 2)))
-    with pytest.raises(TypeError, match="wave is an array of float64; admissible where mode = 'photons' is"):
-        jl.record(np.ones((1, 2)), mode="photons", key=key)
+    with pytest.raises(TypeError, match="wave is an array of float64; admissible is a Waveform"):
+        count(np.ones((1, 2)), key=key)
     with pytest.raises(
         ValueError, match=r"energy = -.* is too far below zero; admissible are samples that all"
     ):
-        jl.record(wave_of(-np.ones(10), np.arange(10.0)), mode="photons", key=key)
+        count(wave_of(-np.ones(10), np.arange(10.0)), key=key)
     with pytest.raises(ValueError, match="energy = nan"):
-        jl.record(wave_of(np.full(10, np.nan), np.arange(10.0)), mode="photons", key=key)
+        count(wave_of(np.full(10, np.nan), np.arange(10.0)), key=key)
     with pytest.raises(ValueError, match=r"detection_probability has shape \(2,\)"):
         events_of(wave, 1, detection_probability=(0.1, 0.2))
     with pytest.raises(ValueError, match="wave has one sample"):
-        jl.record(dark(1), mode="photons", key=key)
+        count(dark(1), key=key)
     with pytest.raises(TypeError, match="outside of JAX transformations"):
-        jax.jit(lambda w: jl.record(w, mode="photons", key=key).time)(wave)
+        jax.jit(lambda w: count(w, key=key).time)(wave)

@@ -36,7 +36,7 @@ def random_traits(count, seed=0):
 def spectra(traits, bands=BANDS):
     """Arrays (leaves, wavelengths) of reflectance and transmittance."""
     leaves = jax.vmap(lambda t: jl.Prospect(**t))({name: jnp.asarray(v) for name, v in traits.items()})
-    return (np.array(s) for s in jl.prospect_spectra(leaves, bands))
+    return (np.array(s) for s in leaves(bands))
 
 
 @pytest.mark.slow
@@ -170,7 +170,7 @@ def test_steps_run_out(noisy_leaves):
 def test_other_versions(version):
     leaf = jl.Prospect(N=1.8, Cab=30.0, Cw=0.015, version=version)
     fit = invert_leaves(BANDS, *map(np.asarray, leaf(BANDS)), leaf=jl.Prospect(version=version))
-    R, T = jl.prospect_spectra(fit.leaves, BANDS)
+    R, T = fit.leaves(BANDS)
     np.testing.assert_allclose(jnp.stack([R[0], T[0]]), jnp.stack(leaf(BANDS)), atol=2e-5)
     np.testing.assert_allclose(fit.traits["Cab"], 30.0, rtol=1e-3)
 

@@ -10,6 +10,8 @@ import inversion
 import jaxlidar as jl
 from inversion.metrics import photons
 from jaxlidar._constants import PLANCK_TIMES_LIGHT
+from jaxlidar.io.icesat2 import PhotonTrack
+from jaxlidar.sensors.photon_counter import PhotonEvents
 
 # An even canopy, m above ground.
 BASE, TOP = 5.0, 15.0
@@ -43,7 +45,7 @@ def track(slope, ground=2.0, canopy=2.0, footprint=0.0):
 
 def events_of(wave, rate, seed=0):
     counter = jl.PhotonCounter(background_rate=rate, window=(-1000.0, 1000.0))
-    return jl.record(wave, receiver=counter, mode="photons", key=jax.random.key(seed))
+    return counter.count(wave, key=jax.random.key(seed))
 
 
 def errors(slope, rate):
@@ -241,7 +243,7 @@ def test_short_tracks_and_tracks_without_photons_have_rows_too():
     rows = dict.fromkeys(
         ("segment_start", "segment_latitude", "segment_longitude", "solar_elevation"), np.zeros(1)
     )
-    empty = jl.io.PhotonTrack(
+    empty = PhotonTrack(
         beam="gt1r",
         segment_id=np.array([7]),
         segment_length=np.array([20.0]),
@@ -267,7 +269,7 @@ def sparse_events(random, rate, per_segment, half_window):
     shot = np.r_[np.repeat(np.arange(SHOTS), noise), np.repeat(np.arange(SHOTS), signal)]
     order = np.lexsort((-height, shot))
     zeros = np.zeros(order.size, int)
-    return jl.PhotonEvents(
+    return PhotonEvents(
         time=-2.0 * height[order] / jl.SPEED_OF_LIGHT,
         height=height[order],
         shot=shot[order],

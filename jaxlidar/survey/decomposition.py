@@ -52,7 +52,9 @@ import optimistix as optx
 from jax import lax
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
-from inversion.metrics.records import (
+from jaxlidar._fields.checks import as_array, check_integer, check_range, concrete
+from jaxlidar._jax.products import matmul
+from jaxlidar.survey.records import (
     Pulse,
     divide,
     divide_by_largest,
@@ -62,7 +64,6 @@ from inversion.metrics.records import (
     sample_pulse,
     size_bucket,
 )
-from jaxlidar.extend import as_array, check_integer, check_range, concrete, decompose_records, matmul
 
 _SOLVER = optx.LevenbergMarquardt(rtol=1e-3, atol=1e-3)
 _MAX_STEPS = 40
@@ -204,21 +205,6 @@ def gaussian_decomposition(
     return _in_units(echoes, times.first, jnp.asarray(magnitude, y.dtype), bins)
 
 
-@decompose_records.register
-def decompose_shots(
-    time: Float[np.ndarray, " bins"],
-    power: Float[np.ndarray, "shots bins"],
-    noise: Float[np.ndarray, "shots bins"],
-    pulse: Float[np.ndarray, " lags"],
-) -> tuple[Int[Array, " shots"], Array, Array, Array]:
-    """Decompose records into copies of a pulse, for `jaxlidar.Waveforms.returns`.
-
-    **Returns:** number of echoes, and their amplitudes, times and widths, (shots, echoes) each.
-    """
-    echoes = gaussian_decomposition(time, power, noise=noise, pulse=pulse)
-    return echoes.count, echoes.amplitude, echoes.time, echoes.width
-
-
 def _check_noise(noise: ArrayLike) -> None:
     """Refuse noise that is not above 0; it may be infinite. **Raises:** ValueError."""
     values = concrete(noise)
@@ -300,7 +286,7 @@ class _EchoShape(NamedTuple):
 def _gaussian_shape(size: int, pulse_width: Array) -> _EchoShape:
     """Gaussians on `size` bins, for a pulse of that standard deviation in samples."""
     number = jnp.arange(size, dtype=pulse_width.dtype)
-    # Of an odd number of samples, so that its middle is one.
+    # An odd number of samples, so that its middle is one.
     kernel = jnp.exp(-0.5 * ((number[: size - 1] - (size // 2 - 1)) / pulse_width) ** 2)
 
     def model(amplitude, centre, width):
