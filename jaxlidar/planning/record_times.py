@@ -83,6 +83,10 @@ def bins_and_samples(
     # Fine bins share edges with the samples, which are centred on their times. Three more bins at each end
     # take the B-spline and rounding.
     edge = begin - 0.5 * interval
+    if window is None:
+        # The earliest first return for which samples begin here: whatever it is, the first bin lies equally far
+        # from the first sample, so that programs are the same.
+        first = min(first, begin - pulse_start)
     lead = math.ceil((edge - first) / width) + 3
     count = lead + math.ceil((last - edge) / width) + 3
     start = edge + width * (0.5 - lead)
@@ -95,13 +99,13 @@ def pulse_band(
 ) -> tuple[int, int]:
     """Return the offsets of samples from fine bins, in fine bins, between which a sample takes from a bin.
 
-    `interval`, `sample_start`: of the samples, ns. Both offsets are rounded outwards to a sixteenth of
+    `interval`, `sample_start`: of the samples, ns. Both offsets are rounded outwards to an eighth of
     the width's octave, so that programs are not compiled for every pulse and window.
     """
     first_sample, half = (sample_start - bins.start) / bins.width, 0.5 * interval
     low = math.floor((pulse_support[0] - half) / bins.width - first_sample) - 2
     high = math.ceil((pulse_support[1] + half) / bins.width - first_sample) + 2
-    step = max((1 << (high - low).bit_length()) // 16, 1)
+    step = max((1 << (high - low).bit_length()) // 8, 1)
     return low // step * step, -(-high // step) * step
 
 

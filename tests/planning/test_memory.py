@@ -213,7 +213,7 @@ def test_a_grazing_beam_over_a_slope_takes_no_matrix():
 @pytest.mark.parametrize(
     ("pulse", "window"),
     [
-        (jl.GaussianPulse(6.0), None),
+        (jl.GaussianPulse(6.0), (-60.0, 60.0)),
         (jl.RectangularPulse(3.0), (-100.0, 3.0)),
         (jl.SampledPulse([-2.0, 0.0, 9.0], [0.0, 1.0, 0.0]), (7.0, 60.0)),
     ],
