@@ -122,23 +122,36 @@ def minimum_in_box(
     return jax.lax.while_loop(go_on, change, start)[0]
 
 
-def held_by_bounds(
+class AtBounds(NamedTuple):
+    """Unknowns at a bound, (n,) each: those that the minimum within bounds has there as well, and the others.
+
+    The gradient of the others points inwards by more than a converged fit admits: the linearised cost falls
+    by more than the square of `BoundedGaussNewton.atol` where they leave their bound.
+    """
+
+    held: Bool[np.ndarray, " n"]
+    leaving: Bool[np.ndarray, " n"]
+
+
+def at_bounds(
     values: Float[np.ndarray, " n"],
     residual: Float[np.ndarray, " data"],
     jacobian: Float[np.ndarray, "data n"],
     lower: Float[np.ndarray, " n"],
     upper: Float[np.ndarray, " n"],
-) -> Bool[np.ndarray, " n"]:
-    """Return True for unknowns at a bound that the minimum within bounds has there as well."""
+) -> AtBounds:
+    """Find unknowns at a bound, by the step to the minimum of the linearised cost within bounds."""
     end = _AT_BOUND * (upper - lower)
     is_at_end = (values < lower + end) | (values > upper - end)
     if not np.any(is_at_end):
-        return is_at_end
+        return AtBounds(is_at_end, is_at_end)
     with jax.enable_x64(True):
-        step, _ = _compiled_bounded_step(
+        step, fall = _compiled_bounded_step(
             *map(jnp.asarray, (jacobian, residual, lower - values, upper - values))
         )
-        return is_at_end & (np.abs(np.asarray(step)) < end)
+    is_held = np.abs(np.asarray(step)) < end
+    falls = float(fall) > BoundedGaussNewton.atol**2
+    return AtBounds(is_at_end & is_held, is_at_end & ~is_held & falls)
 
 
 _compiled_bounded_step = jax.jit(bounded_step)

@@ -45,7 +45,7 @@ from jax.core import Tracer
 from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from inversion.fit.bounded_gauss_newton import held_by_bounds
+from inversion.fit.bounded_gauss_newton import at_bounds
 from inversion.fit.data import ObservedWaveform, with_fixed_window
 from inversion.fit.fit_summary import CompletedFit
 from inversion.fit.model import SimulationInputs, Values, batch_keys
@@ -125,12 +125,12 @@ def estimate_derivatives(
     priors.set_strengths(fit.summary.strength)
     prior_residual, prior_jacobian = priors(values)
     low, high = flat_bounds(unknowns)
-    is_held = held_by_bounds(
+    is_held = at_bounds(
         values,
         np.append(noise.whiten(difference), prior_residual),
         np.concatenate([noise.whiten(jacobian), prior_jacobian]),
         *fit_range(low, high),
-    )
+    ).held
     moves, width = np.flatnonzero(~is_held), (high - low)[~is_held]
     # In widths of the bounds, so that the ridge compares unknowns of different units.
     columns = jacobian[:, moves] * width

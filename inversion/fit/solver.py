@@ -39,7 +39,7 @@ import jax
 import numpy as np
 from jaxtyping import Float, PRNGKeyArray
 
-from inversion.fit.bounded_gauss_newton import BoundedGaussNewton, advance
+from inversion.fit.bounded_gauss_newton import BoundedGaussNewton, advance, at_bounds
 from inversion.fit.data import ObservedWaveform, SampleNoise
 from inversion.fit.fit_summary import CompletedFit, FitDetails, FitSummary, Step
 from inversion.fit.model import Evaluation, batch_stderr
@@ -360,7 +360,8 @@ class LeastSquaresFit:
         """Return the result at an iterate.
 
         1. Whiten Jacobian and deviations of the batches by the present weights.
-        2. Find unknowns at a bound.
+        2. Find unknowns at a bound, and those from whose bound the cost falls inwards: steps that noise of
+           the simulation rejects leave them there.
         3. Compute the covariance of the estimates, and the errors widened by misfit.
         4. Compute reduced chi-squared, and the cost by which fits from several starts are compared.
         """
@@ -383,6 +384,11 @@ class LeastSquaresFit:
             self.prior.basis,
             at_low | at_high,
         )
+        is_leaving = np.zeros(self.low.size, bool)
+        if iterate.is_finite:
+            is_leaving = at_bounds(
+                iterate.values, *self.residuals(iterate), self.lowest, self.highest
+            ).leaving
         stderr = np.sqrt(np.diag(estimate.covariance))
         robust_stderr, independent_samples = self._robust_stderr(
             iterate, stderr, estimate, jacobian, precision
@@ -409,7 +415,7 @@ class LeastSquaresFit:
             second_minimum=np.inf,
             strength=self.prior.strengths,
             converged=converged,
-            status=status + self._notes(estimate.is_undetermined, at_low, at_high),
+            status=status + self._notes(estimate.is_undetermined, at_low, at_high, is_leaving),
             steps=self.n_simulations,
             fitted=np.asarray(evaluation.reflectance),
         )
@@ -435,13 +441,16 @@ class LeastSquaresFit:
         received = self.recorder_model.received(batches - np.mean(batches, axis=0), iterate.recorder_values)
         return received[:, self.is_fitted]
 
-    def _notes(self, is_undetermined: np.ndarray, at_low: np.ndarray, at_high: np.ndarray) -> str:
+    def _notes(
+        self, is_undetermined: np.ndarray, at_low: np.ndarray, at_high: np.ndarray, is_leaving: np.ndarray
+    ) -> str:
         """Return the end of a status: unknowns that are undetermined or at a bound."""
         labels, notes = flat_labels(self.unknowns), ""
         for text, condition in (
             ("the data do not determine {} (infinite standard error)", is_undetermined),
             ("at the lower bound: {}", at_low),
             ("at the upper bound: {}", at_high),
+            ("the misfit falls inwards from the bound of {}", is_leaving),
         ):
             if np.any(condition):
                 notes += "; " + text.format(", ".join(m for m, c in zip(labels, condition) if c))

@@ -6,9 +6,11 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float, Int
 
+from jaxlidar._constants import PLANCK_TIMES_LIGHT
 from jaxlidar._fields.checks import concrete_array, concrete_number
 from jaxlidar.io.datasets import keep_as_netcdf
 from jaxlidar.sensors.lidar import Lidar
+from jaxlidar.sensors.receiver import Receiver
 from jaxlidar.sensors.survey import Survey
 
 # Samples of the pulse per sample of the digitiser: crossings of a level are interpolated between them.
@@ -30,6 +32,8 @@ class Acquisition(eqx.Module):
       echo's time zero, in steps of an eighth of the sampling interval. The middle one is at time zero.
     - `radiometric_constant`: (wavelengths,) J m2: the energy of a return is this times its apparent
       reflectance over its squared range.
+    - `noise`: (wavelengths,) J per sample, standard deviation of what the receiver records without signal:
+      electronic noise, photon noise of the background, and rounding to the steps of the digitiser.
 
     **Example:**
 
@@ -47,6 +51,7 @@ class Acquisition(eqx.Module):
     range_at_time_zero: Float[np.ndarray, " shots"]
     pulse: Float[np.ndarray, " lags"]
     radiometric_constant: Float[np.ndarray, " wavelengths"]
+    noise: Float[np.ndarray, " wavelengths"]
 
 
 # In files, an acquisition is a group of its own beside the waveforms.
@@ -60,6 +65,7 @@ keep_as_netcdf(
         "range_at_time_zero": ("m", "range from which light arrives at time zero"),
         "pulse": ("1", "fraction of an echo that a sample records, by time from the echo's time zero"),
         "radiometric_constant": ("J m2", "energy times squared range per apparent reflectance"),
+        "noise": ("J", "standard deviation of a sample that the receiver records without signal"),
     },
     dimensions={"shots": "shot", "wavelengths": "wavelength", "lags": "lag"},
 )
@@ -76,6 +82,7 @@ def acquisition_of(survey: Survey) -> Acquisition:
         range_at_time_zero=np.zeros(shots) if survey.has_sensor_position else survey.slant_range,
         pulse=sampled_pulse(survey.lidar),
         radiometric_constant=radiometric_constant(survey.lidar),
+        noise=noise_without_signal(survey.lidar),
     )
 
 
@@ -103,3 +110,17 @@ def radiometric_constant(lidar: Lidar) -> Float[np.ndarray, " wavelengths"]:
         concrete_array(a) for a in (lidar.energy_per_wavelength, lidar.efficiency_per_wavelength)
     )
     return energy * efficiency * concrete_number(lidar.aperture_area) / np.pi
+
+
+def noise_without_signal(lidar: Lidar) -> Float[np.ndarray, " wavelengths"]:
+    """Return `Acquisition.noise` of a lidar; zero for a photon counter, which records no samples."""
+    receiver, wavelengths = lidar.receiver, concrete_array(lidar.wavelength)
+    variance = np.zeros(wavelengths.shape)
+    if isinstance(receiver, Receiver):
+        variance += concrete_number(receiver.electronic_noise) ** 2
+        if receiver.photon_noise:
+            variance += PLANCK_TIMES_LIGHT / wavelengths * concrete_number(receiver.background)
+        if receiver.bits is not None and receiver.saturation is not None:
+            # The variance of a number that is uniform within a step.
+            variance += (concrete_number(receiver.saturation) / (2**receiver.bits - 1)) ** 2 / 12.0
+    return np.sqrt(variance)

@@ -23,6 +23,11 @@ sample, where the pulse is smooth, and of less than half a sample at the peak of
 What overlapping or broadened echoes add is the detector's error, as in instruments. An echo that the window
 of the record cuts is placed at the end of the record.
 
+**Noise.** Of a noisy record it is the larger of what its receiver adds without signal, if the survey's lidar
+has it, and of what differences of neighbouring samples tell. A receiver without a pedestal (`background`)
+cuts noise at zero, and such differences tell too little: then it is that of the samples beside zeros, which
+are the positive half of a normal distribution, and a warning says so.
+
 **Threshold.** If none is given, it is the larger of five standard deviations of the noise at the sample,
 and 1 % of the largest sample of the shot.
 
@@ -53,6 +58,7 @@ from jaxlidar._fields.checks import (
     check_number,
     check_numbers,
     check_range,
+    warn_user,
 )
 from jaxlidar._not_kept import NotKept
 from jaxlidar._progress import Progress
@@ -79,6 +85,9 @@ _LOGARITHM_FLOOR = 0.01
 # Background of noisy records: samples above the median by this many standard deviations are echoes; the
 # fraction of a normal distribution one standard deviation or more below its median; most rounds.
 _CLIPPING, _ONE_SIGMA_BELOW, _MAX_CLIPPINGS = 3.0, 0.15866, 20
+# Median of the size of a normal number of unit variance. Noise is cut at zero where more than this fraction
+# of neighbours are a zero and another sample.
+_NORMAL_MEDIAN, _CUT_FRACTION = 0.6745, 0.1
 # Relative differences of the samples of a plateau: rounding, and the range, by which energy falls.
 _PLATEAU_DIFFERENCE = 1e-4
 # Rounding, in samples, of the times that a function gives in single precision.
@@ -287,6 +296,7 @@ class DetectorInput:
       `Truth.returns`, or None.
     - `surface_height`: of the truth, by surface, (shots,) m; empty without truth.
     - `axes`: of the beams. - `acquisition`: of the shots. - `constant`: radiometric constant, J m2.
+    - `receiver_noise`: `Acquisition.noise`, J.
     - `ground_height`: (shots,) m.
     """
 
@@ -300,6 +310,7 @@ class DetectorInput:
     axes: ShotAxes
     acquisition: Acquisition
     constant: float
+    receiver_noise: float
     ground_height: Float[np.ndarray, " shots"]
 
     def __len__(self) -> int:
@@ -352,6 +363,7 @@ def input_of_waveforms(waves: Any, wavelength: Any) -> DetectorInput:
         axes=_shot_axes(waves.position, zenith, azimuth, waves.acquisition.range_at_time_zero),
         acquisition=waves.acquisition,
         constant=float(waves.acquisition.radiometric_constant[w]),
+        receiver_noise=float(waves.acquisition.noise[w]),
         ground_height=np.asarray(waves.ground_height, float),
     )
 
@@ -387,6 +399,7 @@ def input_of_waveform(wave: Any, lidar: Any, wavelength: Any) -> DetectorInput:
         axes=_shot_axes(shot.position, shot.zenith, shot.azimuth, acquisition.range_at_time_zero),
         acquisition=acquisition,
         constant=float(acquisition.radiometric_constant[w]),
+        receiver_noise=float(acquisition.noise[w]),
         # The truth has the mean height of the ground over the footprint.
         ground_height=heights.get("ground", np.full(1, np.nan)),
     )
@@ -812,12 +825,14 @@ def returns_of(
     start_time, blocks = time.perf_counter(), []
     if is_own_record and settings.background is None:
         settings = settings._replace(background=np.full(shape[0], _recorded_background(waves)))
+    if not is_own_record and settings.noise is None:
+        settings = settings._replace(noise=_noise_of_records(waves, records))
     for shots in waves.chunks:
         if detector == "decomposition":
-            for block in _decompose_chunk(waves, records[shots], shots, settings, is_own_record):
+            for block in _decompose_chunk(waves, records[shots], shots, settings):
                 blocks.append(block)
         else:
-            blocks.append(_detect_chunk(waves, records[shots], shots, settings, is_own_record))
+            blocks.append(_detect_chunk(waves, records[shots], shots, settings))
         if progress is not None:
             progress(Progress(shots.stop, len(waves), time.perf_counter() - start_time))
     echoes = {name: np.concatenate([block[name] for block in blocks]) for name in blocks[0]}
@@ -858,7 +873,7 @@ def _recorded_background(waves: DetectorInput) -> float:
 
 
 def _prepare_chunk(
-    waves: DetectorInput, record: np.ndarray, shots: slice, settings: _Settings, is_own_record: bool
+    waves: DetectorInput, record: np.ndarray, shots: slice, settings: _Settings
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
     """Return the records without background, their noise, and the threshold of each, of a chunk of shots."""
     record = np.ascontiguousarray(record)
@@ -870,19 +885,43 @@ def _prepare_chunk(
     if settings.noise is not None:
         noise = settings.noise[shots].astype(record.dtype)
         noise = noise if noise.ndim == 2 else noise[:, None]
-    elif is_own_record:
+    else:
         # The standard error of the simulation, as an energy.
         stderr = np.asarray(waves.stderr[shots])
         if stderr.any():
             noise = stderr * _energy_per_reflectance(waves, shots).astype(record.dtype)
         else:
             noise = np.zeros((len(record), 1), record.dtype)
-    else:
-        # Differences of neighbours have twice the variance; the median ignores the echoes.
-        differences = np.abs(np.diff(record, axis=1)) if record.shape[1] > 1 else np.zeros((len(record), 1))
-        noise = 1.4826 / np.sqrt(2.0) * np.median(differences, axis=1, keepdims=True)
     threshold = None if settings.threshold is None else settings.threshold[shots]
     return record, noise, threshold
+
+
+def _noise_of_records(waves: DetectorInput, records: np.ndarray) -> Float[np.ndarray, " shots"]:
+    """Return the standard deviation of noise of each record, J per sample; see the module's docstring.
+
+    **Warns:** where noise is cut at zero.
+    """
+    noise, n_cut = np.full(len(waves), waves.receiver_noise), 0
+    for shots in waves.chunks if records.shape[1] > 1 else ():
+        record = np.ascontiguousarray(records[shots])
+        # Differences of neighbours have twice the variance; the median ignores the echoes.
+        of_differences = np.median(np.abs(np.diff(record, axis=1)), axis=1) / (np.sqrt(2.0) * _NORMAL_MEDIAN)
+        is_zero = record == 0
+        # An echo without noise begins and ends once.
+        is_beside_zero = is_zero[:, 1:] != is_zero[:, :-1]
+        is_cut = (record.min(axis=1) == 0) & (np.mean(is_beside_zero, axis=1) > _CUT_FRACTION)
+        noise[shots] = np.maximum(of_differences, waves.receiver_noise)
+        for row in np.flatnonzero(is_cut):
+            beside_zero = np.maximum(record[row, 1:], record[row, :-1])[is_beside_zero[row]]
+            noise[shots][row] = max(noise[shots][row], np.median(beside_zero) / _NORMAL_MEDIAN)
+        n_cut += np.count_nonzero(is_cut)
+    if n_cut:
+        warn_user(
+            f"the record of {n_cut} of {len(waves)} shots has noise that is cut at zero, and its noise is "
+            "estimated from what lies above: give the receiver a background of some standard deviations of "
+            "its noise, or noise="
+        )
+    return noise
 
 
 def _median_beside_echoes(record: Float[np.ndarray, "shots samples"]) -> Float[np.ndarray, "shots 1"]:
@@ -918,10 +957,10 @@ def _energy_per_reflectance(waves: DetectorInput, shots: slice) -> Float[np.ndar
 
 
 def _detect_chunk(
-    waves: DetectorInput, record: np.ndarray, shots: slice, settings: _Settings, is_own_record: bool
+    waves: DetectorInput, record: np.ndarray, shots: slice, settings: _Settings
 ) -> dict[str, np.ndarray]:
     """Return the columns of the returns of a chunk of shots, found by all but the decomposition."""
-    record, noise, threshold = _prepare_chunk(waves, record, shots, settings, is_own_record)
+    record, noise, threshold = _prepare_chunk(waves, record, shots, settings)
     pulse, detector = waves.acquisition.pulse, settings.detector
     if isinstance(detector, str):
         echoes = _find_echoes(detector, record, noise, threshold, settings.fraction, pulse)
@@ -1002,14 +1041,14 @@ def _number_in_shot(shot: Int[np.ndarray, " returns"]) -> Int[np.ndarray, " retu
 
 
 def _decompose_chunk(
-    waves: DetectorInput, record: np.ndarray, shots: slice, settings: _Settings, is_own_record: bool
+    waves: DetectorInput, record: np.ndarray, shots: slice, settings: _Settings
 ) -> Iterator[dict[str, np.ndarray]]:
     """Decompose the records of a chunk of shots where there is signal, a batch of windows at a time.
 
     1. Find the stretches of each record in which it exceeds the threshold, a pulse's length more at either
     end. 2. Sort them by length, and decompose as many at once as one compiled program takes.
     """
-    record, noise, threshold = _prepare_chunk(waves, record, shots, settings, is_own_record)
+    record, noise, threshold = _prepare_chunk(waves, record, shots, settings)
     largest = record.max(axis=1, initial=0.0)[:, None]
     if threshold is None:
         threshold = np.maximum(_NOISE_FACTOR * noise, _RELATIVE_THRESHOLD * largest)

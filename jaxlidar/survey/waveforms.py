@@ -243,7 +243,7 @@ class Waveforms(eqx.Module):
           no echo.
         - `noise`: standard deviation of the record in J per sample, one number, (shots,) or (shots,
           samples). Default None: the standard error `stderr`; with a `record`, that of the differences of
-          neighbouring samples.
+          neighbouring samples, or that of the lidar's receiver without signal if that is larger.
         - `threshold`: lowest amplitude of a return, and lowest rise of one above the dip before it, in J
           per sample, positive, one number or (shots,). Default None: the larger of five times the noise,
           and 1 % of the shot's largest sample. A function applies its own: None alone is admissible.
@@ -253,6 +253,9 @@ class Waveforms(eqx.Module):
         - `progress`: a function called with a `Progress` after every few thousand shots. Default None.
 
         **Returns:** a `DiscreteReturns`.
+
+        **Warns:** UserWarning for a `record` whose receiver cuts noise at zero, as one without `background`
+        does: its noise is estimated from the samples above zero.
 
         **Raises:** ValueError for arguments outside their ranges or of other shapes, for waveforms of a
         file of an earlier version, and for times that a function gives outside of the record or in another

@@ -258,6 +258,47 @@ def test_a_noisy_record_is_detected_above_its_noise_and_background(waveforms):
     np.testing.assert_allclose(np.median(stated.reflectance), np.median(returns.reflectance), rtol=0.05)
 
 
+@pytest.mark.parametrize("lidar_has_receiver", [True, False])
+def test_noise_that_the_receiver_cuts_at_zero_is_no_return(lidar_has_receiver):
+    scene = jl.Scene(plates=[jl.Plate(60.0, 0.4, coverage=0.5)], ground=jl.Ground(reflectance=0.3))
+    noise = 6e-15
+    options = {"saturation": 3e-12, "bits": 12, "electronic_noise": noise}
+    receiver, with_pedestal = jl.Receiver(**options), jl.Receiver(**options, background=10 * noise)
+
+    def simulated(receiver):
+        options = {"altitude": 500.0, "sampling_interval": 0.5, "pulse": jl.GaussianPulse(3.0)}
+        lidar = jl.Lidar(**options, receiver=receiver if lidar_has_receiver else jl.Receiver())
+        survey = jl.Survey.grid(lidar, low=(0, 0), high=(9, 9), spacing=1.0)
+        return jl.simulate_many(survey, scene, key=jax.random.key(0), max_orders=1)
+
+    waves = simulated(receiver)
+    record = np.asarray(jl.record(waves, receiver=receiver, key=jax.random.key(1)))
+    assert record.shape[2] > 800
+    with pytest.warns(UserWarning, match="100 of 100 shots has noise that is cut at zero"):
+        returns = waves.returns(record=record)
+    np.testing.assert_array_equal(np.bincount(returns.shot), 2)
+    # Differences of neighbours alone tell a half of this noise, above which samples of noise lie.
+    differences = np.median(np.abs(np.diff(record[:, 0], axis=1)), axis=1) / np.sqrt(2.0) / 0.6745
+    assert len(waves.returns(record=record, noise=differences)) > 300
+    # With a pedestal nothing is cut, and nothing said.
+    pedestal = simulated(with_pedestal)
+    record = np.asarray(jl.record(pedestal, receiver=with_pedestal, key=jax.random.key(1)))
+    np.testing.assert_array_equal(np.bincount(pedestal.returns(record=record).shot), 2)
+
+
+def test_the_acquisition_has_the_noise_of_a_sample_without_signal():
+    wavelength, background = np.array([532.0, 1064.0]), 2e-16
+    receiver = jl.Receiver(saturation=4e-15, bits=6, electronic_noise=3e-17, background=background)
+    survey = jl.Survey(jl.Lidar(wavelength=wavelength, receiver=receiver), [(0.0, 0.0)])
+    waves = jl.simulate_many(survey, jl.Scene(ground=jl.Ground()), key=jax.random.key(0))
+    photons = jl.record(
+        np.zeros((2, 200_000)), wavelength, dataclasses.replace(receiver, bits=None), key=jax.random.key(1)
+    )
+    step = 4e-15 / 63
+    expected = np.hypot(np.std(np.asarray(photons, float), axis=1), step / np.sqrt(12.0))
+    np.testing.assert_allclose(waves.acquisition.noise, expected, rtol=0.01)
+
+
 def test_the_strongest_returns_are_taken_where_there_are_too_many(waveforms):
     returns = waveforms.returns(max_returns=1)
     strongest = waveforms.returns()

@@ -156,6 +156,29 @@ def test_vectors_end_at_the_minimum_within_their_bounds():
     assert max(n_steps) < 20
 
 
+def test_a_fit_held_at_a_bound_by_a_wrong_derivative_says_that_the_misfit_falls_inwards():
+    """The cost falls inwards from a start on two bounds, where steps seem to raise it."""
+    low, high, samples = np.zeros(2), np.ones(2), 20
+    matrix = np.random.default_rng(1).normal(size=(samples, 2))
+    observed = matrix @ np.array([0.6, 0.4])
+    observation = ObservedWaveform(np.arange(samples, dtype=float), observed[None], np.ones((1, samples)))
+    unknown = BoundUnknown("x", Setter(None, None, "geometric"), jnp.asarray(low), low, high, None)
+    status = {}
+    for sign in (1.0, -1.0):
+        recorder, settings = RecorderModel(None, [], LIDAR, samples), SolverSettings(50, 1)
+        fit = LeastSquaresFit(observation, [unknown], recorder, settings)
+
+        def simulate(request, sign=sign):
+            # With the other sign all values within the bounds fit worse, whatever the derivative promises.
+            return Evaluation((sign * matrix @ request.values)[None], matrix[None], None, None)
+
+        status[sign] = run_fit(fit.run(), simulate).summary.status
+    assert "bound" not in status[1.0], status
+    assert status[1.0].startswith("converged"), status
+    assert status[-1.0].startswith("failed: no step improves the fit"), status
+    assert "the misfit falls inwards from the bound of x[0], x[1]" in status[-1.0], status
+
+
 # -- evaluations
 
 
