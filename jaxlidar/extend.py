@@ -8,7 +8,7 @@ For laws, pulses and surfaces of your own, and for packages on top such as `inve
   returns the value of an array, or None where a JAX transformation is tracing it; `even_step` the step of
   times or heights, and refuses uneven ones. `warn_user` warns at the line of the user's code.
 - directions: a `Vec` is a tuple of three arrays, x, y and z; `dot`, `scale`, `add`, `normalise`; `polar` and
-  `from_frame` make directions about an axis, `about` draws one by the cosine law.
+  `from_frame` make directions about an axis, `cosine_direction` draws one by the cosine law.
 - ranges: a class states them by field, `ranges = {"slope": Range(0.0, 90.0)}`; its constructor calls
   `check_ranges`; where JAX is tracing, `inadmissible` detects values outside of them and `reasons` tells
   which.
@@ -45,9 +45,9 @@ from jaxlidar._jax.workers import outcomes, task
 from jaxlidar._vectors import (
     Scalar,
     Vec,
-    about,
     add,
     along,
+    cosine_direction,
     dot,
     from_frame,
     normalise,
@@ -62,7 +62,6 @@ __all__ = [
     "Range",
     "Scalar",
     "Vec",
-    "about",
     "add",
     "along",
     "as_array",
@@ -77,6 +76,7 @@ __all__ = [
     "check_range",
     "check_ranges",
     "concrete",
+    "cosine_direction",
     "dot",
     "einsum",
     "even_step",

@@ -3,7 +3,7 @@
 Symbols: k optical depth of a plate, N number of plates (real), n refractive index, alpha half-angle of the
 cone of incidence. r, t, A reflectance, transmittance and absorptance of one plate in diffuse light; Ra, Ta,
 Aa of the first plate, lit within the cone; Rs, Ts, As of the pile of the others; R, T, 1 - R - T of the leaf.
-Of a surface, t12 and r12 are the transmittance and reflectance for diffuse light from outside, t21 and r21
+t12 and r12 are the transmittance and reflectance of a surface for diffuse light from outside, t21 and r21
 from inside, t_alpha and r_alpha for light within the cone (`jaxlidar.optics.leaf_surface`).
 
 *Plate* (Allen et al. 1969). With the diffuse transmittance tau = 2 E3(k) of the interior, omega = 1 - tau,

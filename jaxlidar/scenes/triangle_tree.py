@@ -61,7 +61,7 @@ _AREA_ROUNDING = 2.0
 _DISTANCE_ROUNDING, _MAX_RISE = 4.0, 100.0
 # Relative slack of the distances at which a ray leaves a box (Ize 2013, J. Comput. Graph. Tech. 2(2), 12).
 _BOX_ROUNDING = 8.0
-# Cells of a repeating scene through which a ray is followed: so many, that only rays which are level to one
+# Cells of a repeating scene through which a ray is followed: only rays which are level to one
 # part in thousands may meet a triangle farther away.
 MAX_PERIODS = 4096
 # Smallest cosine of incidence in derivatives: those of grazing rays are bounded.
@@ -421,12 +421,12 @@ def _next_cell(period: Array, walk: _CellWalk, w: Vec, precision: float) -> tupl
 
 
 def _visit_node(tree: TriangleTree, s: _TreeTraversal, any_hit: bool, precision: float) -> _TreeTraversal:
-    """Let the ray of each lane visit one node.
+    """Let each ray visit one node.
 
     1. Read the row of the node.
-    2. Of an inner node, intersect both boxes, and go on to the nearer one; the trail notes the other.
-    3. Of an instance, transform the ray, and go on to the root of its tree.
-    4. Of a triangle, intersect it. Of two in one plane, keep that with the lower number of material.
+    2. At an inner node, intersect both boxes, and go on to the nearer one; the trail notes the other.
+    3. At an instance, transform the ray, and go on to the root of its tree.
+    4. At a triangle, intersect it. Keep that with the lower number of material of two in one plane.
     5. Where nothing below is met, go on to the next node of the trail; at the end of a lower tree, to that of
        the upper tree; at the end of the latter, stop.
     6. Where the scene repeats and nothing was met, begin again in the next cell.

@@ -18,7 +18,7 @@ from jaxlidar.trace.photons.photons import Photons
 
 # Classes: rays that miss the box of occupied voxels, cross at most about `SHORT_PATH` faces in it, and more.
 N_CLASSES, SHORT_PATH = 3, 32
-# Counts of all classes are packed into one integer, of so many bits each: a chunk has fewer than 1,024
+# Counts of all classes are packed into one integer, of this many bits each: a chunk has fewer than 1,024
 # photons.
 _COUNT_BITS = 10
 

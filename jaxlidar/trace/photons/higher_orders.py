@@ -103,8 +103,8 @@ class HigherOrderTally(eqx.Module):
     - `weights`, `outside`: returns within the bins and outside of them; with both margins while photons are
       traced.
     - `arrived`, `departed`: weight that reached each material, and that went on from it.
-    - `escaped`, `late`, `remaining`: weight that left the scene, that could not be recorded any more, and
-      that was still in flight after the last order.
+    - `escaped`, `flown_outside`, `unfollowed`: weight that left the scene, that could not be recorded any
+      more, and that was still in flight after the last order.
     - `weight_slopes`: derivatives of the returns with respect to parameters; None without score functions.
     """
 
@@ -113,8 +113,8 @@ class HigherOrderTally(eqx.Module):
     arrived: Float[Array, "materials entries"]
     departed: Float[Array, "materials entries"]
     escaped: Float[Array, "entries"]
-    late: Float[Array, "entries"]
-    remaining: Float[Array, "entries"]
+    flown_outside: Float[Array, "entries"]
+    unfollowed: Float[Array, "entries"]
     weight_slopes: Float[Array, "bins parameters wavelengths"] | None = None
 
     def with_arrival(self, material: Array | int, index: TallyIndex, weight: Scalar) -> "HigherOrderTally":
@@ -302,8 +302,8 @@ def trace_photons(
         lanes, tally = batch.trace_orders(batch.send(group), empty, trace_chunk)
         p = lanes.photons
         weight = jnp.where(p.alive, p.weight, 0.0)
-        remaining = add_to_tally(tally.remaining, (), TallyIndex.of(p), weight)
-        tally = eqx.tree_at(lambda t: t.remaining, tally, remaining)
+        unfollowed = add_to_tally(tally.unfollowed, (), TallyIndex.of(p), weight)
+        tally = eqx.tree_at(lambda t: t.unfollowed, tally, unfollowed)
         return jax.tree.map(jnp.add, total, _without_margins(scene, tally)), None
 
     # Likewise with groups, whose photons are kept for each order.
@@ -343,8 +343,8 @@ def empty_tally(scene: DeviceScene, nodes: EntryNodes | None = None) -> HigherOr
         arrived=jnp.zeros((n_materials, n_entries)),
         departed=jnp.zeros((n_materials, n_entries)),
         escaped=jnp.zeros((n_entries,)),
-        late=jnp.zeros((n_entries,)),
-        remaining=jnp.zeros((n_entries,)),
+        flown_outside=jnp.zeros((n_entries,)),
+        unfollowed=jnp.zeros((n_entries,)),
         weight_slopes=None
         if slopes is None
         else jnp.zeros((bins.padded, slopes.count, slopes.history_optics.shape[1])),
@@ -499,8 +499,8 @@ def scatter(
     # no weight.
     flight, weight, index = jax.tree.map(flown.select_end, (flown.flights, flown.weight, flown.index))
     escaped = add_to_tally(tally.escaped, (), index, jnp.where(flight.escaped, weight, 0.0))
-    late = add_to_tally(tally.late, (), index, jnp.where(flight.late, weight, 0.0))
-    tally = eqx.tree_at(lambda t: (t.escaped, t.late), tally, (escaped, late))
+    flown_outside = add_to_tally(tally.flown_outside, (), index, jnp.where(flight.outside, weight, 0.0))
+    tally = eqx.tree_at(lambda t: (t.escaped, t.flown_outside), tally, (escaped, flown_outside))
 
     # The collision is sampled again for the selected end: taking it from the deposits would keep the onward
     # directions of all ends alive.
@@ -817,8 +817,8 @@ def _return_through_surfaces(
        light of shared illumination at nadir, nothing is hidden.
     2. A plate that is crossed is sampled, gap or material, so that each photon has one history; the factor is
        the attached ratio of that outcome.
-    3. Material of a plate that transmits straight on adds its channel to the history; of another it lets
-       nothing through.
+    3. Material of a plate that transmits straight on adds its channel to the history; that of
+       another plate lets nothing through.
     """
     draws, to_sensor = iter(plate_draws), scene.beam.distance_to_sensor(x)
     # What lies behind the sensor is not crossed.
