@@ -14,7 +14,7 @@ For laws, pulses and surfaces of your own, and for packages on top such as `inve
   which.
 - `check_kinds` refuses objects that are not a lidar and a scene.
 - `fingerprint` is a hash of everything that a result depends on, to compare with that of a stored result.
-- `once` is an optimisation barrier: the compiler computes its arguments once, instead of again in each
+- `barrier` is an optimisation barrier: the compiler computes its arguments once, instead of again in each
   expression that uses them.
 - `einsum`, `matmul` and `tensordot` are those of `jax.numpy`, in full precision on every device: by default,
   GPUs round their factors.
@@ -38,7 +38,7 @@ from jaxlidar._fields.checks import (
 )
 from jaxlidar._fields.ranges import Range, check_ranges, inadmissible, reasons
 from jaxlidar._fingerprint import fingerprint
-from jaxlidar._jax.one_function import once
+from jaxlidar._jax.one_function import barrier
 from jaxlidar._jax.products import einsum, matmul, tensordot
 from jaxlidar._jax.threads import ONE_CORE, side_by_side
 from jaxlidar._jax.workers import outcomes, task
@@ -67,6 +67,7 @@ __all__ = [
     "as_array",
     "as_numpy",
     "as_scalar",
+    "barrier",
     "check_integer",
     "check_key",
     "check_kind",
@@ -85,7 +86,6 @@ __all__ = [
     "inadmissible",
     "matmul",
     "normalise",
-    "once",
     "outcomes",
     "polar",
     "reasons",

@@ -33,7 +33,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxlidar._jax.one_function import once
+from jaxlidar._jax.one_function import barrier
 from jaxlidar.optics import expint
 
 _Single = Float[Array, "..."]
@@ -270,7 +270,7 @@ def refine_decay(
     """
     scale, reciprocal = expint.scale_and_reciprocal(k)
     # The excess serves v and its logarithm: the barrier keeps the compiler from computing it for each.
-    is_thin, excess = w < 0.3, once(_decay_excess(k, scale, reciprocal, w, v, kappa))
+    is_thin, excess = w < 0.3, barrier(_decay_excess(k, scale, reciprocal, w, v, kappa))
     log_term = minus_log_corrected(v, w, is_thin, excess)
     change = v * excess
     v = scale * (v + change)

@@ -41,7 +41,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxlidar._jax.mesh_axes import vary_with
-from jaxlidar._jax.one_function import once, one_function
+from jaxlidar._jax.one_function import barrier, one_function
 from jaxlidar._vectors import FAR, Scalar, Vec, cross, dot, scale, vec, with_derivative_of
 
 # Numbers in a row of the table.
@@ -449,8 +449,8 @@ def _visit_node(tree: TriangleTree, s: _TreeTraversal, any_hit: bool, precision:
     boxes = [
         _box_distance(row[k : k + 3], row[k + 6 : k + 9], start, inverse, reach, precision) for k in (0, 3)
     ]
-    # Each number of the next state follows from these: without `once` the compiler repeats them in all.
-    (first_met, first_near), (second_met, second_near) = once(boxes)
+    # Each number of the next state follows from these: without `barrier` the compiler repeats them in all.
+    (first_met, first_near), (second_met, second_near) = barrier(boxes)
     descends = ~is_leaf & (first_met | second_met)
     takes_second = second_met & (~first_met | (second_near < first_near))
     # 3.
@@ -464,11 +464,11 @@ def _visit_node(tree: TriangleTree, s: _TreeTraversal, any_hit: bool, precision:
     # 4.
     distance, rounding = _triangle_distance(row, start, direction, instance.one_sided, precision)
     if s.material is None or s.rounding is None:
-        distance = once(distance)
+        distance = barrier(distance)
         is_nearer = s.active & s.inside & is_leaf & (distance < s.distance)
         material = nearest_rounding = None
     else:
-        distance, rounding = once((distance, rounding))
+        distance, rounding = barrier((distance, rounding))
         # Zero for the same material, and where nothing has been met.
         order = jnp.where(s.row > 0, jnp.sign(s.material - row[9]), 0.0)
         farthest = s.distance + order * (s.rounding + rounding)

@@ -31,7 +31,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int, UInt32
 
-from jaxlidar._jax.one_function import once, one_function
+from jaxlidar._jax.one_function import barrier, one_function
 from jaxlidar._jax.vmapped_loops import any_problem, largest_count
 from jaxlidar._vectors import Scalar, Vec
 from jaxlidar.planning.config import Scatterer
@@ -260,15 +260,15 @@ def _subtract_lengths(
     medium = scene.medium
     assert medium is not None
     end, largest = minimum(ray.leave, max_length), jnp.max(targets, axis=0)
-    ray, end, largest, targets, amounts = once((ray, end, largest, targets, amounts))
+    ray, end, largest, targets, amounts = barrier((ray, end, largest, targets, amounts))
 
     def step(state: _SubtractingMarch, _):
         distance, depth, voxel, running = state
-        faces = once(ray.face_distances(voxel))
+        faces = barrier(ray.face_distances(voxel))
         to = maximum(distance, minimum(end, minimum(minimum(faces[0], faces[1]), faces[2])))
         cell = cell_index(medium, voxel)
         k = medium.extinction(cell, w)
-        to, cell, k = once((to, cell, k))
+        to, cell, k = barrier((to, cell, k))
         length = select(running, to - distance, jnp.zeros_like(to))
         lost = jnp.zeros_like(to)
         for target, amount in zip(targets, amounts):

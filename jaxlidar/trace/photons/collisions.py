@@ -25,7 +25,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int
 
-from jaxlidar._jax.one_function import once
+from jaxlidar._jax.one_function import barrier
 from jaxlidar._vectors import Scalar, Vec, along, cosine_direction, dot, polar, scale, vec
 from jaxlidar.optics.facets import facet_normal, facet_reflection, facet_transmission
 from jaxlidar.optics.phase import AbstractPhase
@@ -330,7 +330,7 @@ def intensity_factors(
         cos_scattering = dot(w, v)
         # The means over the normals of spherically oriented facets, so that the sampled normal does not
         # matter; behind an optimisation barrier, as they serve several results.
-        front, back = once((facet_reflection(cos_scattering), facet_transmission(cos_scattering)))
+        front, back = barrier((facet_reflection(cos_scattering), facet_transmission(cos_scattering)))
         in_voxel = collision.surface < 0
         if config.leaf is not None:
             transmits.append(config.leaf.transmission >= 0)

@@ -43,7 +43,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, UInt32
 
 from jaxlidar._constants import SPEED_OF_LIGHT
 from jaxlidar._jax.mesh_axes import vary_with
-from jaxlidar._jax.one_function import once
+from jaxlidar._jax.one_function import barrier
 from jaxlidar._jax.vmapped_loops import any_problem, largest_count
 from jaxlidar._vectors import FAR, Scalar, Vec, along
 from jaxlidar.trace.deposit import add_rows, bspline_row
@@ -222,7 +222,7 @@ class PhotonBatch:
                 number = source[chunk]
                 in_chunk = jax.tree.map(lambda a: a.at[number].get(mode="promise_in_bounds"), flat)
                 alive = chunk * chunk_size + jnp.arange(chunk_size) < n_living
-                return once(eqx.tree_at(lambda c: c.photons.alive, in_chunk, alive))
+                return barrier(eqx.tree_at(lambda c: c.photons.alive, in_chunk, alive))
 
             def trace(in_chunk, sums):
                 draws = PhotonDraws.from_numbers(self.lattices(in_chunk.lane, order), scene.n_plates)
@@ -463,7 +463,7 @@ def fly(
         flights = move_landings(scene, p, encounters, flights, order > 0)
     # Optimisation barrier: flights serve several results, each of which would compute the march again.
     stops = (encounters.stops, encounters.nearest_stop, encounters.mesh_normal)
-    p, draws, flights, stops = once((p, draws, flights, stops))
+    p, draws, flights, stops = barrier((p, draws, flights, stops))
     stops, nearest_stop, mesh_normal = stops
     encounters = dataclasses.replace(
         encounters, stops=stops, nearest_stop=nearest_stop, mesh_normal=mesh_normal
@@ -669,7 +669,7 @@ def returns_of_ends(
     value = jnp.where(ends.flights.has_hit, weight, 0.0) * ends.collision.weight / n_ends
     # Optimisation barrier: of the collision only what its return depends on passes, so that directions onward
     # are not computed.
-    w, x, path, value, index, collision, plate_draws, score = once(
+    w, x, path, value, index, collision, plate_draws, score = barrier(
         (
             ends.p.w,
             ends.x,
@@ -743,16 +743,16 @@ def _returns_of_collisions(
     if scene.shot_views is not None:
         assert index.entry_point is not None
         # One row for each shot that may see the path.
-        shots, seen, delay = once(scene.shot_views.seen_by_shots(beam.axis, index.entry_point, x))
+        shots, seen, delay = barrier(scene.shot_views.seen_by_shots(beam.axis, index.entry_point, x))
         time, value, material = time[:, None] + delay, value[:, None] * seen, material[:, None]
     # One row serves all channels and wavelengths, which differ by factors alone.
-    first_bin, row = once(bspline_row(bins, time, value))
+    first_bin, row = barrier(bspline_row(bins, time, value))
     rows = []
     for channel, factor in channel_factors:
         factor = jnp.where(channel >= 0, factor, 0.0)
         for tally_row, optical_weight in index.after(scene, channel).rows(shots):
             # Optimisation barrier: fused into the rows, the factor would be computed again for each bin.
-            scaled = once(factor if optical_weight is None else factor * optical_weight)
+            scaled = barrier(factor if optical_weight is None else factor * optical_weight)
             scaled = scaled.reshape(scaled.shape + (1,) * (row.ndim - 1))
             rows.append((material * n_entries + tally_row, row * scaled))
     return BinnedReturns(first_bin, rows, row, channel_factors, index, score)
