@@ -208,7 +208,7 @@ def system_of_crs(location: str, crs: Any) -> CoordinateSystem:
         return CoordinateSystem()
     pyproj = import_pyproj("coordinate reference systems")
     if not isinstance(crs, pyproj.CRS):
-        # Of rasterio.
+        # Those of rasterio.
         crs = pyproj.CRS.from_wkt(crs.to_wkt(version="WKT2_2019"))
     name, kind, horizontal, vertical = crs.name or "an unnamed system", "map", None, None
     for component in crs.sub_crs_list or [crs]:

@@ -178,7 +178,7 @@ def make_survey_context(setup: Setup) -> SurveyContext:
 
 
 def shots_to_trace(n_shots: int) -> int:
-    """Return the number of shots that a program for a chunk of so many has room for: a size bucket."""
+    """Return the number of shots that a program for a chunk of `n_shots` has room for: a size bucket."""
     return size_bucket(n_shots, 1)
 
 
