@@ -29,7 +29,7 @@ NOISE_FRACTION, NOISE_FLOOR = 0.03, 0.01
 WINDOW = (-115.0, 60.0)
 # Photons and rays of each simulation of the retrieval.
 FIT_PHOTONS, FIT_RAYS = 16384, 2048
-# Of the figures, dots per inch.
+# Dots per inch of the figures.
 RESOLUTION = 130
 
 

@@ -14,7 +14,7 @@ def percent(fraction: float) -> str:
     return f"{float(f'{100 * fraction:.2g}'):g} %"
 
 
-def late_fraction(wave: Any) -> float:
+def outside_fraction(wave: Any) -> float:
     """Return the largest fraction, of all wavelengths, of light that is in flight when the record ends."""
     return float(np.max(np.asarray(wave.energy_budget["after the window"]), initial=0.0))
 
@@ -61,9 +61,9 @@ def summary(wave: Any) -> str:
         title,
         *(f"  {name.ljust(width)}  " + "  ".join(c.rjust(8) for c in cells) for name, cells in rows.items()),
     ]
-    if late_fraction(wave) >= NOTABLE_FRACTION:
+    if outside_fraction(wave) >= NOTABLE_FRACTION:
         lines.append(
-            f"  {percent(late_fraction(wave))} of the light is still on its way when the record ends"
+            f"  {percent(outside_fraction(wave))} of the light is still on its way when the record ends"
         )
     if truncated_fraction(wave) >= NOTABLE_FRACTION:
         lines.append(f"  orders beyond the last may add {percent(truncated_fraction(wave))}")

@@ -9,7 +9,7 @@ import jax
 import numpy as np
 from jax.core import Tracer
 
-# From here on, six digits do not resolve a metre of a map coordinate; beyond, so many digits say nothing.
+# From here on, six digits do not resolve a metre of a map coordinate; beyond, digits say nothing.
 _COORDINATE, _HUGE = 1e5, 1e10
 # Longest line of an object's text, and the longest row of numbers that is written out.
 _MAX_LINE, _MAX_ROW = 100, 4

@@ -103,7 +103,7 @@ def polar(cosine: Scalar, azimuth: Scalar) -> Vec:
     return sine * jnp.cos(azimuth), sine * jnp.sin(azimuth), cosine
 
 
-def about(normal: Vec, u: Scalar, v: Scalar) -> Vec:
+def cosine_direction(normal: Vec, u: Scalar, v: Scalar) -> Vec:
     """Draw a direction by the cosine law about the unit vector `normal`.
 
     The density is cos(theta) / pi: cos(theta) = sqrt(1 - u), azimuth = 2 pi v.

@@ -8,13 +8,13 @@ For laws, pulses and surfaces of your own, and for packages on top such as `inve
   returns the value of an array, or None where a JAX transformation is tracing it; `even_step` the step of
   times or heights, and refuses uneven ones. `warn_user` warns at the line of the user's code.
 - directions: a `Vec` is a tuple of three arrays, x, y and z; `dot`, `scale`, `add`, `normalise`; `polar` and
-  `from_frame` make directions about an axis, `about` draws one by the cosine law.
+  `from_frame` make directions about an axis, `cosine_direction` draws one by the cosine law.
 - ranges: a class states them by field, `ranges = {"slope": Range(0.0, 90.0)}`; its constructor calls
   `check_ranges`; where JAX is tracing, `inadmissible` detects values outside of them and `reasons` tells
   which.
 - `check_kinds` refuses objects that are not a lidar and a scene.
 - `fingerprint` is a hash of everything that a result depends on, to compare with that of a stored result.
-- `once` is an optimisation barrier: the compiler computes its arguments once, instead of again in each
+- `barrier` is an optimisation barrier: the compiler computes its arguments once, instead of again in each
   expression that uses them.
 - `einsum`, `matmul` and `tensordot` are those of `jax.numpy`, in full precision on every device: by default,
   GPUs round their factors.
@@ -38,16 +38,16 @@ from jaxlidar._fields.checks import (
 )
 from jaxlidar._fields.ranges import Range, check_ranges, inadmissible, reasons
 from jaxlidar._fingerprint import fingerprint
-from jaxlidar._jax.one_function import once
+from jaxlidar._jax.one_function import barrier
 from jaxlidar._jax.products import einsum, matmul, tensordot
 from jaxlidar._jax.threads import ONE_CORE, side_by_side
 from jaxlidar._jax.workers import outcomes, task
 from jaxlidar._vectors import (
     Scalar,
     Vec,
-    about,
     add,
     along,
+    cosine_direction,
     dot,
     from_frame,
     normalise,
@@ -62,12 +62,12 @@ __all__ = [
     "Range",
     "Scalar",
     "Vec",
-    "about",
     "add",
     "along",
     "as_array",
     "as_numpy",
     "as_scalar",
+    "barrier",
     "check_integer",
     "check_key",
     "check_kind",
@@ -77,6 +77,7 @@ __all__ = [
     "check_range",
     "check_ranges",
     "concrete",
+    "cosine_direction",
     "dot",
     "einsum",
     "even_step",
@@ -85,7 +86,6 @@ __all__ = [
     "inadmissible",
     "matmul",
     "normalise",
-    "once",
     "outcomes",
     "polar",
     "reasons",

@@ -83,6 +83,7 @@ WRONG_SHAPE = {
     "jl.Lidar(altitude=(1.0, 2.0))": "altitude has shape (2,); admissible is one number",
     "jl.Lidar(wavelength=np.ones((2, 2)))": "wavelength has shape (2, 2); admissible is one number",
     "jl.Lidar(energy=[[1.0], [1.0, 2.0]])": "energy has rows of different lengths; admissible is a",
+    "jl.Survey.scan(jl.Lidar(), jl.Conical(15, 8), (0, 0), (0, 9), 9, [1, 2])": "pulse_rate has shape (2,)",
     "jl.GaussianPulse(fwhm=(3.0, 6.0))": "fwhm has shape (2,); admissible is one number",
     "jl.Prospect(Cab=[[1.0], [2.0, 3.0]])": "Cab has rows of different lengths; admissible is a regular",
     "jl.Habit(height=[[1.0], [2.0, 3.0]])": "height has rows of different lengths; admissible is a",

@@ -38,7 +38,7 @@ def machine(record: dict) -> str:
     m = record["machine"]
     text = f"Measured on {m['cores']} cores ({m['processor']}), Python {m['python']}, jax {m['jax']}."
     if "system share" in m:
-        text += f" Of {m['CPU seconds']:.0f} CPU seconds the operating system took {m['system share']:.0%}."
+        text += f" The operating system took {m['system share']:.0%} of {m['CPU seconds']:.0f} CPU seconds."
     return text
 
 

@@ -29,7 +29,7 @@ def stand(density: jax.Array, base: jax.Array, reflectance: jax.Array) -> jl.Sce
 
 
 def stands(count: int) -> jl.Scene:
-    """Return a stack of so many random stands."""
+    """Return a stack of random stands."""
     keys = jax.random.split(jax.random.key(0), 2)
     densities = jax.random.uniform(keys[0], (count, 1, 1, 12), maxval=0.3)
     bases, reflectances = jax.random.uniform(keys[1], (2, count), minval=0.1, maxval=0.4)

@@ -69,7 +69,7 @@ def analog_returns(
 
     **Raises:** ValueError for values outside their ranges; for a canopy with the hot spot, because photons
     that fly back on their own take paths independent of their paths in; for several wavelengths where leaves
-    transmit straight on; and for a plan of so many orders that it keeps no histories.
+    transmit straight on; and for a plan that keeps no histories, because of the number of its orders.
 
     **Source:** section 1.4 of the paper.
     """

@@ -42,7 +42,7 @@ def run_notebook(l1b):
     """Run the code of the notebook with the pulses of a file. **Returns:** its variables."""
     os.environ["GEDI_L1B"] = str(l1b)
     variables: dict[str, Any] = {"__name__": "__main__"}
-    # Of the notebook's output, this script writes the numbers to its record.
+    # This script writes the numbers of the notebook's output to its record.
     with contextlib.redirect_stdout(io.StringIO()):
         for cell in json.loads(NOTEBOOK.read_text())["cells"]:
             if cell["cell_type"] == "code":

@@ -70,7 +70,7 @@ def bounded_step(
     information += jnp.maximum(ridge, jnp.sqrt(tiny)) * jnp.eye(width.size)
     gradient = matmul(scaled.T, residual)
     step = width * minimum_in_box(information, gradient, low / width, high / width)
-    # Of the problem itself, without the ridge.
+    # The problem itself, without the ridge.
     return step, jnp.sum(residual**2) - jnp.sum((residual + matmul(jacobian, step)) ** 2)
 
 

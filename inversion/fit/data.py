@@ -61,7 +61,7 @@ class SampleNoise(NamedTuple):
         scaled = self._over_sigma(x)
         if self._is_diagonal:
             return scaled
-        # Not finite differences, of a simulation that failed, pass through: the solver rejects them.
+        # Differences that are not finite, where a simulation failed, pass through: the solver rejects them.
         return linalg.solve_triangular(self._cholesky, scaled, lower=True, check_finite=False)
 
     def times_precision(self, x: Float[np.ndarray, "samples ..."]) -> Float[np.ndarray, "samples ..."]:

@@ -84,7 +84,7 @@ _ADMISSIBLE_FIELDS = (
 )
 # Fields whose limits must be above zero.
 _POSITIVE_FIELDS = ("sampling_interval", "divergence")
-# Bounds of wavelengths, nm: those of the leaf models. Of other values: this factor about those of the lidar.
+# Bounds of wavelengths, nm: those of the leaf models. Other values may change by this factor.
 _WAVELENGTHS, _DEFAULT_FACTOR = (400.0, 2500.0), 4.0
 # Default noise, as a fraction of the largest sample.
 _NOISE_FRACTION = 0.01
@@ -99,8 +99,8 @@ _COARSE_TOLERANCE, _FINE_TOLERANCE, _NEAR_BEST = 0.1, 0.01, 1.5
 _NEAR_LOWEST = 4.0
 # Cost of a design that is not finite, such as one of two equal wavelengths; of its logarithm.
 _REJECTED_COST = 1e6
-# The optimiser ends where a step lowers the logarithm of the cost by less than so many roundings, relative to
-# it, or by less than the second number.
+# The optimiser ends where a step lowers the logarithm of the cost by less than this many roundings,
+# relative to it, or by less than the second number.
 _ROUNDINGS, _FINEST_TOLERANCE = 4.0, 2e-9
 
 Noise = ArrayLike | Callable[[Lidar, Array], Array] | None

@@ -235,8 +235,8 @@ def profile_likelihood(
     values: ArrayLike | Sequence,
     *,
     key: PRNGKeyArray,
-    max_steps: float = 50,
-    starts: float = 1,
+    max_steps: int = 50,
+    starts: int = 1,
     progress: Callable[[int], None] | None = None,
 ) -> Profile:
     """Profile likelihood of one unknown: all others are fitted at each of several fixed values of it.
@@ -284,7 +284,7 @@ def profile_likelihood(
         raise ValueError(f"values has the shape {points.shape}; admissible are two or more, increasing")
     check_range("values", points, float(fixed.low), float(fixed.high))
     free_unknowns = [u for u, bound_u in zip(problem.unknowns, unknowns) if bound_u is not fixed]
-    # Of the first fits, and smoothness priors without mean are about them: no fit moves these.
+    # The starts of the first fits, which smoothness priors without mean are about: no fit moves these.
     starts_of_free = {u.name: np.asarray(u.start) for u in unknowns if u is not fixed}
     levels = [u.prior_level for u in unknowns if u is not fixed]
     middle = int(np.argmin(np.abs(points - float(fixed.start))))

@@ -63,7 +63,7 @@ _RIDGE = 1e-13
 
 
 class FitInputs(NamedTuple):
-    """Numbers of a `Problem`, and of a key, that JAX may be tracing. Of the last two are no derivatives.
+    """Numbers of a `Problem`, and of a key, that JAX may be tracing. The last two have no derivatives.
 
     `key_data`: of the random key, which programs cannot hand to the host as it is.
     """

@@ -41,7 +41,7 @@ class TraceSizes(NamedTuple):
 
 
 def trace_sizes(
-    n_photons: float | None, n_rays: float | None, max_orders: int | None, plan: Plan | None
+    n_photons: int | None, n_rays: int | None, max_orders: int | None, plan: Plan | None
 ) -> TraceSizes:
     """Return the size of a simulation from the arguments of `Problem`.
 

@@ -161,8 +161,8 @@ class Problem(eqx.Module):
     recorder: Recorder | Sequence[Recorder] | None = eqx.field(default=None, kw_only=True)
     noise_floor: float = eqx.field(default=1e-3, kw_only=True)
     plan: Plan | None = eqx.field(default=None, kw_only=True)
-    n_photons: float | None = eqx.field(default=None, kw_only=True)
-    n_rays: float | None = eqx.field(default=None, kw_only=True)
+    n_photons: int | None = eqx.field(default=None, kw_only=True)
+    n_rays: int | None = eqx.field(default=None, kw_only=True)
     max_orders: int | None = eqx.field(default=None, kw_only=True)
 
     def __check_init__(self):

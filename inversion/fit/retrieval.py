@@ -45,8 +45,8 @@ def retrieve(
     problem: Problem,
     *,
     key: PRNGKeyArray,
-    max_steps: float = 50,
-    starts: float = 1,
+    max_steps: int = 50,
+    starts: int = 1,
     progress: Callable[[Step], None] | None = None,
     throw: bool = False,
 ) -> Retrieval:
@@ -243,7 +243,7 @@ def retrieval_of_record(problem: BoundProblem, fitted: FittedRecord) -> Retrieva
     return retrieval_of(fit, problem.all_unknowns, model.scene_at(scene_values), waveform)
 
 
-def solver_settings(max_steps: float, starts: float) -> SolverSettings:
+def solver_settings(max_steps: int, starts: int) -> SolverSettings:
     """Check the numbers of a fit. **Raises:** ValueError for inadmissible ones."""
     return SolverSettings(check_integer("max_steps", max_steps), check_integer("starts", starts))
 

@@ -57,7 +57,7 @@ from jaxlidar.extend import (
 )
 from jaxlidar.io.store import ResultStore, dataset_of_rows, open_store
 
-# Fits of a chunk of the store. Of each quantity a chunk is a file: fewer files, and small ones to rewrite.
+# Fits of a chunk of the store. A chunk of each quantity is a file: few files, and small ones to rewrite.
 _FITS_PER_CHUNK = 16
 # Chunks of a worker are this many times its lockstep group: it is busy while slow fits end, and loses little
 # if it dies.
@@ -68,8 +68,8 @@ def retrieve_many(
     problem: Problem,
     *,
     key: PRNGKeyArray,
-    max_steps: float = 50,
-    starts: float = 1,
+    max_steps: int = 50,
+    starts: int = 1,
     lanes: int = 16,
     path: str | os.PathLike[str] | None = None,
     executor: Executor | None = None,

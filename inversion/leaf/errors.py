@@ -40,7 +40,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from inversion.leaf.solver import map_in_chunks, residual_rounding
-from jaxlidar.extend import einsum, once
+from jaxlidar.extend import barrier, einsum
 from jaxlidar.optics.leaf_surface import LeafSurface
 from jaxlidar.optics.plate_model import plate_model_slopes
 
@@ -188,7 +188,7 @@ def _trait_errors(
         k = einsum("i,ij->j", x[1:], absorption) / x[0]
         values, dR_dk, dR_dN = (jnp.stack(v[:2]) for v in plate_model_slopes(k, x[0], surface))
         # Optimisation barrier: without it the compiler would compute the model again for every sum below.
-        values, dR_dk, dR_dN = once((values, dR_dk, dR_dN))
+        values, dR_dk, dR_dN = barrier((values, dR_dk, dR_dN))
         N_column = dR_dN - dR_dk * k[None] / x[0]
         content_columns = absorption[:, None] * dR_dk[None] / x[0]
         return values, jnp.concatenate([N_column[None], content_columns]), dR_dk * k[None]

@@ -39,7 +39,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
-from jaxlidar.extend import matmul, once
+from jaxlidar.extend import barrier, matmul
 from jaxlidar.optics.leaf_surface import LeafSurface
 from jaxlidar.optics.plate_model import plate_model_slopes
 
@@ -175,7 +175,7 @@ def _fit_leaf(
         k = matmul(x[1:], absorption) / x[0]
         values, dR_dk, dR_dN = (jnp.stack(v[:2]) for v in plate_model_slopes(k, x[0], surface))
         # Optimisation barrier: without it the compiler would compute the model again for every sum below.
-        values, dR_dk, dR_dN = once((values, dR_dk, dR_dN))
+        values, dR_dk, dR_dN = barrier((values, dR_dk, dR_dN))
         deviation = values - observed
         residual, s = deviation * inverse_sigma, dR_dk * inverse_sigma / x[0]
         N_column = dR_dN * inverse_sigma - s * k[None]

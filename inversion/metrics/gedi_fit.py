@@ -182,7 +182,7 @@ def fit_gedi_shots(
 
     1. Prepare every shot about each of its possible grounds.
     2. Fit them all together.
-    3. Of each shot choose the better fit, and judge record and fit.
+    3. Choose the better fit of each shot, and judge record and fit.
 
     **Arguments:**
 
@@ -194,7 +194,7 @@ def fit_gedi_shots(
     **Raises:** what `inversion.retrieve_many` raises for `path`; nothing for a single shot.
     """
     prepared: list[PreparedShot] = []
-    # Of each shot the numbers of its fits, or the reason why it has none.
+    # The numbers of the fits of each shot, or the reason why it has none.
     candidates: list[range | str] = []
     for shot, *elevations in zip(shots, ground, lowest_mode, strict=True):
         try:

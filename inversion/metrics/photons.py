@@ -611,7 +611,7 @@ def _posterior(evidence: np.ndarray, offsets: np.ndarray) -> np.ndarray:
 
 
 def _rare_count(expected: np.ndarray, places: np.ndarray | float) -> np.ndarray:
-    """Return the smallest count that background reaches at any of so many places only by `_FALSE_GOOD`."""
+    """Return the smallest count that background reaches at any of `places` places only by `_FALSE_GOOD`."""
     probability = np.minimum(_FALSE_GOOD / np.maximum(places, 1.0), 1.0)
     return stats.poisson.isf(probability, expected) + 1.0
 

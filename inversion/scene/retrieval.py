@@ -76,7 +76,7 @@ from jaxlidar.io.store import ResultStore, dataset_of_rows, open_store
 
 # Rays of a footprint unless they are given: one for each column of voxels in it, within limits; photons.
 _RAYS, _PHOTONS = (32, 512), 2048
-# A fit stops when the held-out misfit (or the objective) has not fallen by this fraction in so many steps.
+# A fit stops when the held-out misfit (or the objective) has not fallen by this fraction in this many steps.
 _LEAST_GAIN, _PATIENCE = 1e-3, 10
 # Pairs of steps and gradients that L-BFGS-B keeps; draws of the diagonal that scales the unknowns.
 _MEMORY, _SCALE_DRAWS = 20, 4

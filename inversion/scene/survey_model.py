@@ -15,8 +15,8 @@ products with vectors:
 
 **Chunks.** Shots are sorted by place and cut into chunks of one size; a compiled program traces the shots of
 a chunk one after the other, and chunks run side by side on all cores. The cotangents of each shot are summed
-over a complete voxel map: for narrow beams this would take most of the time. Of one order over a map with
-open sides, a chunk gets a window of the map, as large as its beams need.
+over a complete voxel map: for narrow beams this would take most of the time. At first order
+over a map with open sides, a chunk gets a window of the map, as large as its beams need.
 
 **Common random numbers.** The rays and photons of a shot follow from its number and the key. So m is a
 deterministic function of x, smooth but for small jumps where rays cross surfaces, and a fit can use methods

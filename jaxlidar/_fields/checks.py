@@ -15,7 +15,7 @@ import warnings
 from collections.abc import Callable, Sequence
 from numbers import Real
 from types import FrameType, UnionType
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -25,6 +25,9 @@ from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Float
 
 from jaxlidar._text import number_text
+
+# Numbers as users give them: one, an array, or rows of them in lists and tuples.
+Numbers: TypeAlias = ArrayLike | Sequence[Any]
 
 # Largest distance of times or heights from evenly spaced ones, over their step.
 _UNEVENNESS = 0.05
@@ -450,7 +453,7 @@ MAGNITUDES = {
     "energy": Magnitude("J", 0.0, 100.0, {"uJ": 1e-6, "mJ": 1e-3}),
     # From a femtosecond.
     "sampling_interval": Magnitude("ns", 1e-6, np.inf, {"s": 1e9}),
-    # Of pulses, to two microseconds: those of wind lidars last less than one.
+    # To two microseconds: pulses of wind lidars last less than one.
     "fwhm": Magnitude("ns", 1e-6, 2e3, {"s": 1e9, "ps": 1e-3}),
     "length": Magnitude("ns", 1e-6, 2e3, {"s": 1e9, "ps": 1e-3}),
     "decay": Magnitude("ns", 1e-6, 2e3, {"s": 1e9, "ps": 1e-3}),
@@ -468,7 +471,7 @@ MAGNITUDES = {
     "Cm": Magnitude("g/cm2", 0.0, 1.0, {"g/m2": 1e-4, "ug/cm2": 1e-6}),
     "Cp": Magnitude("g/cm2", 0.0, 1.0, {"g/m2": 1e-4, "ug/cm2": 1e-6}),
     "Cc": Magnitude("g/cm2", 0.0, 1.0, {"g/m2": 1e-4, "ug/cm2": 1e-6}),
-    # Of trees: the tallest has 116 m, the thickest 12 m.
+    # The tallest tree has 116 m, the thickest 12 m.
     "height": Magnitude("m", 0.0, 200.0, {"cm": 1e-2, "mm": 1e-3}),
     "trunk_diameter": Magnitude("m", 0.0, 20.0, {"cm": 1e-2, "mm": 1e-3}),
 }

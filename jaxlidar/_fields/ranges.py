@@ -59,9 +59,9 @@ class Range(NamedTuple):
     increasing: bool = False
 
 
-# Of a reflectance, a transmittance, a probability.
+# The range of a reflectance, a transmittance, a probability.
 FRACTION = Range(0.0, 1.0)
-# Of reflectance + transmittance, which rounding of measured or single-precision values may lift above 1.
+# The range of reflectance + transmittance, which rounding may lift above 1.
 SUM_OF_FRACTIONS = Range(0.0, 1.0 + 1e-6)
 
 

@@ -46,7 +46,7 @@ def one_function(loop: Callable[[State], Result]) -> Callable[[State], Result]:
     return _called_separately(loop, xla_cpu_small_call="true") if _needs_hints() else loop
 
 
-def once(values: State) -> State:
+def barrier(values: State) -> State:
     """Return the same values behind an optimisation barrier: they are computed once for all their uses."""
     # Older versions drop the barrier itself, but not a function call around it.
     if _needs_hints():

@@ -14,7 +14,7 @@ from jaxlidar.cli.constants import COMMANDS, version
 from jaxlidar.io import atomic_write
 
 LINK = re.compile(r"(!?)\[([^]]*)\]\(([^)#\s]*)(#[^)]*)?\)")
-# Of the web pages that are made from pages of documentation.
+# The folder of the web pages that are made from pages of documentation.
 PAGES = "pages"
 
 

@@ -31,7 +31,7 @@ _MAX_SHOTS_FOR_NOISE = 1000
 
 
 def evenly_spaced(count: int) -> slice:
-    """Return a slice of so many shots that selects at most a thousand of them, evenly spaced."""
+    """Return a slice of `count` shots that selects at most a thousand of them, evenly spaced."""
     return slice(0, count, -(-count // _MAX_SHOTS_FOR_NOISE))
 
 

@@ -83,7 +83,7 @@ _SEMI_MAJOR_AXIS, _ECCENTRICITY2 = 6378137.0, 0.00669437999014
 GEOGRAPHIC, GEOGRAPHIC_3D = "EPSG:4326", "EPSG:4979"
 # Accuracy, m, of a transformation of which nothing is said.
 _FINE_ACCURACY = 0.1
-# No unit of length has so many metres; a degree, or a gradian, of latitude has some 1e5.
+# No unit of length has this many metres; a degree, or a gradian, of latitude has some 1e5.
 _MIN_METRES_PER_ANGLE = 1e4
 # Elevations in m from which light returns: from the deepest trench to the highest clouds.
 MIN_ELEVATION, MAX_ELEVATION = -12_000.0, 20_000.0
@@ -208,7 +208,7 @@ def system_of_crs(location: str, crs: Any) -> CoordinateSystem:
         return CoordinateSystem()
     pyproj = import_pyproj("coordinate reference systems")
     if not isinstance(crs, pyproj.CRS):
-        # Of rasterio.
+        # Those of rasterio.
         crs = pyproj.CRS.from_wkt(crs.to_wkt(version="WKT2_2019"))
     name, kind, horizontal, vertical = crs.name or "an unnamed system", "map", None, None
     for component in crs.sub_crs_list or [crs]:
@@ -567,7 +567,7 @@ class CoordinateUnits(NamedTuple):
 
 
 def is_angle(metres: Float[np.ndarray, " 3"]) -> bool:
-    """Return True if so many metres per unit of x, y and z are those of longitude, latitude and height."""
+    """Return True if metres per unit of x, y and z are those of longitude, latitude and height."""
     return bool(metres[1] > _MIN_METRES_PER_ANGLE)
 
 

@@ -10,7 +10,7 @@ read only if it has numbers, its chunks are all stored, and its size is plausibl
 **Texts.** Attributes that are texts of variable length lie in global heaps. HDF5 goes through a heap from
 object to object, by the sizes that they state. At a step of no length, as over zeros, it stays for ever, in
 compiled code that no signal interrupts (found with HDF5 2.0). So such attributes are read through a stream
-that refuses heaps like that. Of products only they are: a stream of Python is slower than HDF5's own.
+that refuses heaps like that. Only attributes of products are: a stream of Python is slower than HDF5's own.
 """
 
 import contextlib
@@ -110,7 +110,7 @@ class ProductFile:
             return name in self.file
 
     def dataset(self, name: str, product: str, ndim: int = 1) -> Any:
-        """Return a dataset of numbers of so many dimensions, all of which are stored in the file.
+        """Return a dataset of numbers of `ndim` dimensions, all of which are stored in the file.
 
         **Raises:** ValueError, naming the file and the dataset, where that is not so.
         """

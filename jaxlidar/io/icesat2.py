@@ -160,7 +160,7 @@ def read_atl03(
 ) -> PhotonTrack:
     """Read the photons of one beam of an ICESat-2 ATL03 file, or of a subset, along a stretch of its track.
 
-    This needs h5py (`pip install "jaxlidar[io]"`). Of the photons only those of the stretch are read.
+    This needs h5py (`pip install "jaxlidar[io]"`). Only the photons of the stretch are read.
 
     **Arguments:**
 

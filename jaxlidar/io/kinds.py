@@ -44,8 +44,6 @@ from jaxlidar.sensors.trajectory import Trajectory
 
 # Exported classes of these packages are kinds.
 _PACKAGES = ("jaxlidar.optics.", "jaxlidar.sensors.", "jaxlidar.scenes.")
-# But for results of photon counting, which come after a simulation.
-_NO_KINDS = ("PhotonEvents",)
 # Functions that return scenes or lidars, or objects in them, and classes of other packages.
 _FUNCTIONS: tuple[Callable[..., Any], ...] = (
     *(Branching, Habit, broadleaf, conifer, shrub, spreading_tree, grow, forest),
@@ -171,7 +169,6 @@ def kinds() -> Mapping[str, Callable[..., Any]]:
         and issubclass(value, eqx.Module)
         and value.__module__.startswith(_PACKAGES)
         and not inspect.isabstract(value)
-        and name not in _NO_KINDS
     }
     return {**classes, **{function.__qualname__: function for function in _FUNCTIONS}}
 

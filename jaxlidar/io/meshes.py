@@ -238,7 +238,7 @@ def _read_other(path: Path, part: str, uses_unit: bool) -> _StoredMesh:
 def _check_text(path: Path) -> list[str]:
     """Return the lines of the header of a PLY file; refuse text files of PLY and STL that end early.
 
-    Of these, trimesh reads the triangles before their end.
+    trimesh reads the triangles before the end of these.
     """
     ending = path.suffix.lower()
     content = path.read_bytes() if ending in (".ply", ".stl") else b""

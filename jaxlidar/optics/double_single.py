@@ -33,7 +33,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxlidar._jax.one_function import once
+from jaxlidar._jax.one_function import barrier
 from jaxlidar.optics import expint
 
 _Single = Float[Array, "..."]
@@ -270,11 +270,11 @@ def refine_decay(
     """
     scale, reciprocal = expint.scale_and_reciprocal(k)
     # The excess serves v and its logarithm: the barrier keeps the compiler from computing it for each.
-    is_thin, excess = w < 0.3, once(_decay_excess(k, scale, reciprocal, w, v, kappa))
+    is_thin, excess = w < 0.3, barrier(_decay_excess(k, scale, reciprocal, w, v, kappa))
     log_term = minus_log_corrected(v, w, is_thin, excess)
     change = v * excess
     v = scale * (v + change)
-    # Of v and 1 - v, the smaller is corrected and the other derived from it.
+    # The smaller of v and 1 - v is corrected, and the other one derived from it.
     w = jnp.where(is_thin, w - change, 1 - v)
     return (w, jnp.where(is_thin, 1 - w, v)), add(split(jnp.where(k < 1, 0.0, k)), log_term)
 
@@ -287,7 +287,7 @@ def _decay_excess(
     two_minus_omega = add_singles(2.0, -omega.head)
     two_minus_omega = DoubleSingle(two_minus_omega.head, two_minus_omega.tail - omega.tail)
     z = multiply(omega, add(multiply(kappa, two_minus_omega), omega))
-    # Of v and 1 - v, the smaller is taken as exact, and the other one is derived from it in twice the digits.
+    # The smaller of v and 1 - v is taken as exact, and the other one is derived from it in twice the digits.
     is_thin = w < 0.3
     unscaled_v = scale * v
     exact_v = where(is_thin, add_singles(1.0, -w), split(v))

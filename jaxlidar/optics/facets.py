@@ -18,7 +18,7 @@ import functools
 import jax.numpy as jnp
 import numpy as np
 
-from jaxlidar._vectors import Scalar, Vec, about, scale
+from jaxlidar._vectors import Scalar, Vec, cosine_direction, scale
 
 # f(pi), per unit of intercepted and reflected light. Per leaf area, with G = 1/2, this is Ross's R/3.
 FACET_BACKSCATTER = 2.0 / 3.0
@@ -95,4 +95,4 @@ def facet_normal(incident: Vec, u: Scalar, v: Scalar) -> Vec:
 
     **Returns:** a unit vector.
     """
-    return about(scale(incident, jnp.asarray(-1.0)), u, v)
+    return cosine_direction(scale(incident, jnp.asarray(-1.0)), u, v)

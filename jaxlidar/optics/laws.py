@@ -37,7 +37,7 @@ from jaxtyping import Array, Float
 
 from jaxlidar._fields.checks import scalar
 from jaxlidar._fields.ranges import Range, check_ranges
-from jaxlidar._vectors import Scalar, Vec, about, cross, dot, from_frame, polar, vec
+from jaxlidar._vectors import Scalar, Vec, cosine_direction, cross, dot, from_frame, polar, vec
 
 
 class AbstractLaw(eqx.Module):
@@ -180,7 +180,7 @@ class Lambertian(AbstractLaw):
         return jnp.ones_like(incident[0])
 
     def sample(self, incident: Vec, normal: Vec, u: Scalar, v: Scalar) -> Vec:
-        return about(normal, u, v)
+        return cosine_direction(normal, u, v)
 
     def density(self, incident: Vec, normal: Vec, out: Vec) -> Scalar:
         return jnp.maximum(dot(normal, out), 0.0) / np.pi
@@ -277,7 +277,7 @@ class Specular(AbstractMirror):
         return jnp.ones_like(incident[0])
 
     def sample(self, incident: Vec, normal: Vec, u: Scalar, v: Scalar) -> Vec:
-        # Of two independent normal deviates the distance from zero has Rayleigh's distribution; inverted.
+        # The distance of two independent normal deviates from zero has Rayleigh's distribution; inverted.
         tilt = self.roughness * jnp.sqrt(-2.0 * jnp.log1p(-u))
         lobe = polar(jnp.cos(jnp.minimum(tilt, 1.5)), 2 * np.pi * v)
         out = from_frame(_mirror_direction(incident, normal), lobe)

@@ -3,7 +3,7 @@
 Symbols: k optical depth of a plate, N number of plates (real), n refractive index, alpha half-angle of the
 cone of incidence. r, t, A reflectance, transmittance and absorptance of one plate in diffuse light; Ra, Ta,
 Aa of the first plate, lit within the cone; Rs, Ts, As of the pile of the others; R, T, 1 - R - T of the leaf.
-Of a surface, t12 and r12 are the transmittance and reflectance for diffuse light from outside, t21 and r21
+t12 and r12 are the transmittance and reflectance of a surface for diffuse light from outside, t21 and r21
 from inside, t_alpha and r_alpha for light within the cone (`jaxlidar.optics.leaf_surface`).
 
 *Plate* (Allen et al. 1969). With the diffuse transmittance tau = 2 E3(k) of the interior, omega = 1 - tau,
@@ -47,7 +47,7 @@ from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, ArrayLike, Bool, Float
 
 from jaxlidar._fields.checks import check_numbers
-from jaxlidar._jax.one_function import once
+from jaxlidar._jax.one_function import barrier
 from jaxlidar.optics import double_single, expint
 from jaxlidar.optics.double_single import DoubleSingle
 from jaxlidar.optics.leaf_surface import LeafSurface
@@ -180,7 +180,7 @@ class _PileState(NamedTuple):
 def _state(k: _Reals, M: _Reals, face: LeafSurface, kappa: DoubleSingle | None) -> _PileState:
     """Evaluate plate and pile: the equations of the module's docstring from top to bottom."""
     # The barriers keep the compiler from computing these again for every output (twice as fast on the CPU).
-    tau, omega = once((expint.tau(k), expint.omega(k)))
+    tau, omega = barrier((expint.tau(k), expint.omega(k)))
     q, p = face.t21 + face.r21 * omega, 1 + face.r21 * tau
     inside = face.t21 * tau / (q * p)
     t, Ta = face.t12 * inside, face.t_alpha * inside
@@ -204,7 +204,7 @@ def _state(k: _Reals, M: _Reals, face: LeafSurface, kappa: DoubleSingle | None) 
         )
         w = w + (fine_w - jax.lax.stop_gradient(w))
         v = v + (fine_v - jax.lax.stop_gradient(v))
-    beta, V, Z = once(_decay(w, jax.lax.stop_gradient(v), M, fine_beta))
+    beta, V, Z = barrier(_decay(w, jax.lax.stop_gradient(v), M, fine_beta))
     W = jnp.where(is_clear, M, Z * (1 + V) / (jnp.where(is_clear, 1.0, w) * (1 + v)))
     D = s * g * W + 1 + V * V
     return _PileState(tau, t, r, A, Ta, Ra, Aa, q, p, y, s, g, v, w, beta, V, Z, W, D)

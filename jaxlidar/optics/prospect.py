@@ -53,7 +53,7 @@ from jaxlidar._fields.checks import (
     warn_units,
 )
 from jaxlidar._fields.ranges import Range, check_ranges
-from jaxlidar._jax.one_function import once
+from jaxlidar._jax.one_function import barrier
 from jaxlidar._jax.products import tensordot
 from jaxlidar.optics.coefficients import TRAITS, Coefficients, shipped
 from jaxlidar.optics.leaf_surface import LeafSurface, leaf_surface
@@ -272,7 +272,7 @@ class Prospect(eqx.Module):
         k = self._k(absorption)
         (R, T, _), (R_k, T_k, _), (R_N, T_N, _) = plate_model_slopes(k, self.N, face)
         # Without this optimisation barrier the compiler would compute them again for every trait.
-        R, T, R_k, T_k, R_N, T_N = once((R, T, R_k, T_k, R_N, T_N))
+        R, T, R_k, T_k, R_N, T_N = barrier((R, T, R_k, T_k, R_N, T_N))
         # At constant contents dk/dN = -k/N.
         k_over_N = k / self.N
         slopes = {"N": (R_N - R_k * k_over_N, T_N - T_k * k_over_N)}

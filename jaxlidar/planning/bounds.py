@@ -200,7 +200,7 @@ class Bounds:
     def orders_beyond(self, order: int) -> float:
         """Largest fraction of the sum S that orders above `order` can have.
 
-        Let E be the energy that is scattered in these orders. Of it at most v E returns, with the largest
+        Let E be the energy that is scattered in these orders. At most v E of it returns, with the largest
         intensity factor v of any material and directions, so that the fraction is at most
 
             v E / (F + v E) = 1 / (1 + F / (v E)).
@@ -284,7 +284,7 @@ class Bounds:
     def _largest_scattered_per_return(self) -> PerWavelength:
         """Largest ratio of the energy that canopy and ground scatter once to its return, without plates.
 
-        Of a ray whose transmittance through the canopy is x, canopy and ground scatter and return
+        Canopy and ground scatter and return, of a ray whose transmittance through the canopy is x,
 
             scattered <= (1 - x) (R + T)_max + x R_ground,
             returned >= (1 - x^kappa) / kappa (R v)_min + x^kappa R_ground v_min,

@@ -98,9 +98,9 @@ def effect_table(
             likely = min(order_choice.beyond, upper_bound)
             rows.append(Effect(name, False, f"likely below {percent(likely)}", upper_bound, "sum"))
             # What comes after a window that has all of order one is of higher order.
-            late = bound("multiple scattering", off) if records_all_of_order_one else 1.0
+            outside = bound("multiple scattering", off) if records_all_of_order_one else 1.0
             reason = "light on its way at the end of the record"
-            rows.append(Effect("after the window", False, reason, late, "sum"))
+            rows.append(Effect("after the window", False, reason, outside, "sum"))
     if without_effects(lidar, scene, off)[1].atmosphere is not None:
         name = "scattering within the atmosphere"
         rows.append(Effect(name, False, "beyond first order", bound(name, off), "sum"))

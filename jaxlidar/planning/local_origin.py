@@ -25,7 +25,7 @@ def move_aim_to_origin(lidar: Lidar, scene: Scene) -> tuple[Lidar, Scene]:
     position = concrete(lidar.position)
     if position is None:
         return lidar, scene
-    # Of a sensor the height stays.
+    # The height of a sensor stays.
     aim, height = position[:2], position[2:]
     # `moved` returns None for surfaces that cannot be moved.
     surfaces = (*(() if scene.ground is None else (scene.ground,)), *scene.plates, *scene.meshes)

@@ -43,9 +43,9 @@ _COMPILATION = 150e6
 # time. (Smaller ones lose a quarter at most so, and with histories a change of the number of wavelengths
 # compiles nothing) ...
 LARGE_RESPONSE = 24e6
-# ... for at most so many wavelengths, whose deposits are then made one by one.
+# ... for at most this many wavelengths, whose deposits are then made one by one.
 MAX_APPLIED_WAVELENGTHS = 8
-# The pulse is a dense matrix of fine bins and samples up to so many elements; beyond, it is a band.
+# The pulse is a dense matrix of fine bins and samples up to this many elements; beyond, it is a band.
 MAX_DENSE_PULSE = 1 << 22
 
 
@@ -59,7 +59,7 @@ def response_bytes(config: TraceConfig, bins: TimeBins, *, degree: int, n_traces
 
 
 def band_size(width: int, bins_per_sample: int) -> int:
-    """Return the number of elements of the matrices of a band of so many fine bins.
+    """Return the number of elements of the matrices of a band of `width` fine bins.
 
     See `jaxlidar.spectral.pulse_convolution`: two blocks of fine bins by the samples of a tile.
     """
@@ -126,7 +126,7 @@ def keeps_histories(response: float, with_histories: float, applied: float, limi
 def jacobian_bytes(
     config: TraceConfig, bins: TimeBins, *, degree: int, n_traces: int, batches: int, columns: int
 ) -> float:
-    """Return the bytes of a geometric Jacobian with so many columns at once, without compilation.
+    """Return the bytes of a geometric Jacobian with `columns` columns at once, without compilation.
 
     The responses of all batches are kept for the columns of optical unknowns; batches run on all cores.
     """
@@ -146,7 +146,7 @@ def transformed_bytes(config: TraceConfig, bins: TimeBins, *, degree: int, n_tra
 
 
 def scored_bytes(config: TraceConfig, bins: TimeBins, *, cells: int, columns: int, wavelengths: int) -> float:
-    """Return the bytes of score functions for so many columns, on all cores.
+    """Return the bytes of score functions for `columns` columns, on all cores.
 
     **Arguments:** `cells`: voxels of the map. `columns`: unknowns that change extinction alone.
     """

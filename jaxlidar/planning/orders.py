@@ -9,7 +9,7 @@ tau, q tends to the decay per scattering of the slowest diffusion mode,
 
 where 1.42 = 2 x 0.71 are the two extrapolation lengths (Case and Zweifel 1967).
 
-A trace that keeps scattering histories has room for a limited number of orders. Where so many would leave out
+A trace that keeps scattering histories has room for a limited number of orders. Where these would leave out
 more than the tolerance, optics are applied while light is traced: then there is no such limit.
 """
 
@@ -53,7 +53,7 @@ class OrderChoice(NamedTuple):
     - `count`: the number. - `reason`: in words. - `beyond`: estimated fraction of the light in all later
       orders.
     - `affordable_orders`: largest number for which the table of histories stays small enough.
-    - `needs_applied_optics`: True where so many orders would leave out more than the tolerance.
+    - `needs_applied_optics`: True where these orders would leave out more than the tolerance.
     """
 
     count: int
@@ -188,7 +188,7 @@ def calls_for_more_orders(
     histories: bool,
     xp: Any,
 ) -> Any:
-    """Return True if `choose_orders` would follow more than so many orders for a tolerance.
+    """Return True if `choose_orders` would follow more than `orders` orders for a tolerance.
 
     It follows 1 + ln(rtol / 10) / ln q, rounded up, and two at least. `xp`: jax.numpy for values that a JAX
     transformation traces.

@@ -43,7 +43,7 @@ FARTHEST_SCENE = 1e5
 _SENSOR_TRIANGLE_PAIRS = 30_000_000
 # Beams at a smaller angle, degrees, to a plane meet it beyond the record, which they would make endless.
 LEAST_GRAZING_ANGLE = 0.5
-# A flight crosses at most so many voxels, because a batch waits for its longest flight.
+# A flight crosses at most this many voxels, because a batch waits for its longest flight.
 MAX_VOXELS = 16_384
 # Fine bins of a ray segment at most: all deposits are spread over as many bins as the longest needs.
 _MAX_SEGMENT_BINS = 64
@@ -155,7 +155,7 @@ class PathLengths:
     def __init__(self, lidar: Lidar, scene: Scene, survey: Survey | None = None, *, xp: Any = np):
         """`xp`: jax.numpy for a lidar or a scene that a JAX transformation traces; default numpy."""
         self.scene, self.xp = scene, xp
-        # Of one lidar alone: no survey is traced.
+        # A traced lidar is one lidar: no survey is traced.
         shots = TracedBeam.of(lidar) if xp is jnp else Survey.of(lidar) if survey is None else survey
         self.from_sensor = shots.has_sensor_position
         self.vertical = xp is np and not np.any(shots.zenith) and not self.from_sensor
@@ -441,7 +441,7 @@ def check_sensors(shots: Survey, scene: Scene) -> None:
         i = int(np.argmax(is_bad))
         if where != "level":
             raise ValueError(
-                # Of a scene that was moved to its local origin the height alone is the user's.
+                # The height alone is the user's where a scene was moved to its local origin.
                 f"sensor{which.format(i)} at the height {sensor[i, 2]:.9g} m is {where}, "
                 f"{float(height[i]):.3g} m above it; admissible is more than {LEAST_CLEARANCE:g} m"
             )
@@ -455,8 +455,8 @@ def check_sensors(shots: Survey, scene: Scene) -> None:
 def _check_clear_of_triangles(shots: Survey, mesh: MeshSurface) -> None:
     """Refuse a sensor in a triangle: by rounding it would be on either side.
 
-    Sensors outside of the boxes of all instances are clear. Where many are within, as of a vehicle in a city,
-    so many pairs are looked at that it takes about a second.
+    Sensors outside of the boxes of all instances are clear. Where many are within, such as that of a
+    vehicle in a city, so many pairs are looked at that it takes about a second.
 
     **Raises:** ValueError with the shot.
     """

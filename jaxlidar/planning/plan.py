@@ -352,7 +352,7 @@ def plan(
             "sensor; admissible is lidar_ratio = None, or a lidar with an altitude"
         )
     # From here on x = y = 0 is the aim point, or the middle of the survey (see `local_origin`).
-    survey = None if survey is None else survey.about(concrete_array(lidar.position)[:2])
+    survey = None if survey is None else survey.relative_to(concrete_array(lidar.position)[:2])
     lidar, scene = move_aim_to_origin(lidar, scene)
     # 1. Effects: leaf or bark that is zero everywhere, relief of flat terrain, and meshes out of reach are
     # off, then what the user switches off. The table compares with everything else in place.

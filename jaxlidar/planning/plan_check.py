@@ -107,7 +107,8 @@ def _misfits(plan: Plan, lidar: Lidar, scene: Scene, checks: Sequence[Callable],
     ground = scene.ground
     if xp is jnp:
         yield Misfit(footprint_is_off_terrain(lidar, scene), lambda: "the footprint lies off the terrain")
-    # Of what the plan takes to be flat, empty or out of reach, `make_setup` refuses what is traced.
+    # What the plan takes to be flat, empty or out of reach is not checked where it is traced: `make_setup`
+    # refuses it.
     if plan.scope.flat_terrain and isinstance(ground, Terrain) and ground.relief:
         has_relief = not is_traced(ground.heights) and not ground.is_plane()
         yield Misfit(has_relief, lambda: "it takes the terrain for a plane; make one for this terrain")

@@ -46,8 +46,8 @@ def bins_and_samples(
 
     1. A sample has a whole number of fine bins, none wider than `target`.
     2. Returns come from the first of order one to the last and its tail.
-    3. Samples cover these and the pulse, or the window of the user. Of the latter returns are those that the
-       pulse carries into it.
+    3. Samples cover these and the pulse, or the window of the user; the returns of a window are those that
+       the pulse carries into it.
     4. Fine bins go from the first return that reaches a sample to the last, and three more at each end.
 
     `tail` is the time, ns, during which multiple scattering is recorded after the last return of first order.

@@ -2,7 +2,7 @@
 
 A compiled simulation has loops of fixed length and a fixed time axis, which have to be long enough for every
 scene. Both are monotonic in quantities such as heights, sizes and slopes, so that scenes at the extremes of
-these decide. Of a stack of scenes, as many as have an extreme value of any array are examined, and two that
+these decide. All scenes of a stack that have an extreme value of any array are examined, and two that
 combine the smallest and the largest values of all geometric arrays.
 """
 

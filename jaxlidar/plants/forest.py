@@ -64,8 +64,8 @@ def forest(
     **Returns:** a `Stand`, a sequence of `Tree` in the order of placement. The position of a tree is its
     `base`.
 
-    **Raises:** ValueError for arguments outside the ranges above, and if so many trees cannot be placed at
-    that distance; TypeError for an object that is no `Habit`. Random placement fills at most about
+    **Raises:** ValueError for arguments outside the ranges above, and if the trees cannot be placed at that
+    distance; TypeError for an object that is no `Habit`. Random placement fills at most about
     0.7 / minimum_distance^2 stems per m2.
 
     **Example:**

@@ -268,7 +268,7 @@ class LSystem:
             word = next_word
         if steps is None:
             raise ValueError(
-                f"max_steps = {max_steps}: rules still apply to the word after so many rewritings"
+                f"max_steps = {max_steps}: rules still apply to the word after {max_steps} rewritings"
             )
         return word
 

@@ -294,7 +294,7 @@ def _filled_up(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return hits and ground returns of columns that all have the mean number of returns nearby, as one.
 
-    Of a column with r times the mean, the fraction 1 - 1/r is surplus. It goes to the columns nearby that
+    The surplus of a column with r times the mean is the fraction 1 - 1/r. It goes to the columns nearby that
     have less, in proportion to what they lack.
     """
     tiny = 1e-12

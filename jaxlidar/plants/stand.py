@@ -7,7 +7,7 @@ from typing import Any, final, overload
 import numpy as np
 from jaxtyping import Float, Int
 
-from jaxlidar._fields.checks import check_kind, check_number, check_range, check_shape
+from jaxlidar._fields.checks import Numbers, check_kind, check_number, check_range, check_shape
 from jaxlidar.plants.tree import Tree
 from jaxlidar.scenes.terrain import Terrain
 
@@ -57,11 +57,11 @@ class Stand(Sequence[Tree]):
     def __init__(
         self,
         individuals: Tree | Sequence[Tree],
-        position: Any,
-        individual: Any = None,
-        azimuth: Any = None,
-        scale: Any = None,
-        leaf_area: Any = None,
+        position: Numbers,
+        individual: Numbers | None = None,
+        azimuth: Numbers | None = None,
+        scale: Numbers | None = None,
+        leaf_area: Numbers | None = None,
     ):
         check_kind("individuals", individuals, Tree | Sequence, "a Tree or several")
         trees = [individuals] if isinstance(individuals, Tree) else list(individuals)
@@ -199,7 +199,7 @@ class Stand(Sequence[Tree]):
         """Return the number of leaf clumps of each tree."""
         return np.array([len(tree.bud_radius) for tree in self.individuals])[self.individual]
 
-    def with_tree_leaf_area(self, area: Any) -> "Stand":
+    def with_tree_leaf_area(self, area: Numbers) -> "Stand":
         """Return the stand with other leaf areas of its trees, each divided evenly among their clumps.
 
         **Arguments:**

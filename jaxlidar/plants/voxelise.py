@@ -219,7 +219,7 @@ def _voxelise_stand(
     n_copies = 0
     for key, copies in patterns.items():
         fine = Grid.enclosing(*_bounding_box(turned[key]), size / _OFFSETS, None, None)
-        # Of one m2 in each clump, where the areas are given.
+        # One m2 in each clump, where the areas are given.
         unit_area = None if leaf_area is None else 1.0
         amounts = _sum_material(turned[key], fine, unit_area, wood, -(-samples // _OFFSETS))
         tables = [_summed_area_table(a) for a in amounts]

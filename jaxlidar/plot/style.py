@@ -23,7 +23,7 @@ MATERIAL_COLOURS = {
     "plate": "#56B4E9",
     "mesh": "#CC79A7",
 }
-# Of the other materials of meshes.
+# Colours of the other materials of meshes.
 _MESH_COLOURS = ("#CC79A7", "#D55E00", "#0072B2", "#F0E442", "#56B4E9", "#000000")
 OTHER_COLOUR = "#999999"
 TOTAL_COLOUR = "#1A1A1A"

@@ -40,8 +40,8 @@ def tree(
     - `ax`: the three-dimensional axes to draw on. Default None: those of a new figure.
     - `leaves`: True to draw the buds. Default True.
     - `alpha`: opacity of a bud, in [0, 1]. Default 0.25.
-    - `max_buds`: largest number of buds that are drawn, at least 1. Of more buds, about as many are drawn,
-      each enlarged to make up for those left out. Default 60,000.
+    - `max_buds`: largest number of buds that are drawn, at least 1. If there are more, about as many are
+      drawn, each enlarged to make up for those left out. Default 60,000.
     - `elevation`: angle of the view above the horizon, degrees. Default 8.
     - `azimuth`: direction towards the viewer, degrees clockwise from north. Default 200.
 

@@ -67,7 +67,7 @@ def _add(a: Any, b: Any) -> Any:
 
 
 def _mean_waveform(total: Response, batches: Array, model: WaveformModel) -> Waveform:
-    """Make the waveform of the mean of so many responses."""
+    """Make the waveform of the mean of the responses of `batches` batches."""
     return waveform_of_model(total, model.for_sum_of(batches))
 
 

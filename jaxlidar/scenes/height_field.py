@@ -37,7 +37,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxlidar._fields.checks import array_namespace, fixed_array
 from jaxlidar._jax.mesh_axes import vary_together
-from jaxlidar._jax.one_function import once
+from jaxlidar._jax.one_function import barrier
 from jaxlidar._jax.vmapped_loops import any_problem
 from jaxlidar._vectors import FAR, Scalar, Vec, along, dot, normalise, vec, with_derivative_of
 from jaxlidar.scenes.raster import Cell, Raster
@@ -151,7 +151,7 @@ class HeightField(AbstractShape):
     def tangent(self, x: Vec) -> tuple[Vec, Scalar]:
         height, (slope_x, slope_y) = self.heights.value_and_slope(x)
         # Optimisation barrier: compilers would repeat the look-up for every result that depends on it.
-        normal, height = once((normalise((-slope_x, -slope_y, jnp.ones_like(slope_x))), height))
+        normal, height = barrier((normalise((-slope_x, -slope_y, jnp.ones_like(slope_x))), height))
         return normal, dot(normal, (x[0], x[1], height))
 
     def distance(self, x: Vec, w: Vec) -> Scalar:
@@ -290,14 +290,14 @@ class HeightField(AbstractShape):
             return any_problem(jnp.sum(state.active) > stop_at) & (state.steps < max_steps)
 
         def advance(state: _Traversal) -> _Traversal:
-            # `once` is an optimisation barrier: compilers would compute shared values again for every field
+            # An optimisation barrier: compilers would compute shared values again for every field
             # of the new state.
-            stays_above, block_exit, block_next = once(self._cross_block(ray, state))
+            stays_above, block_exit, block_next = barrier(self._cross_block(ray, state))
             faces = ray.face_distances((state.i, state.j))
             cell_exit = jnp.minimum(jnp.minimum(faces[0], faces[1]), ray.exit_distance)
             cell_exit = jnp.maximum(state.distance, cell_exit)
             length = cell_exit - state.distance
-            a, b, c = once(self._clearance(ray, state.distance, (state.i, state.j)))
+            a, b, c = barrier(self._clearance(ray, state.distance, (state.i, state.j)))
             # A ray that is known to be above may be below by rounding.
             c = jnp.where(state.above, jnp.maximum(c, 0.0), c)
             end_clearance = (a * length + b) * length + c
@@ -305,7 +305,7 @@ class HeightField(AbstractShape):
             falls_through = (c >= 0) & (end_clearance < 0)
             has_root = is_real & (root >= 0) & (root <= length)
             hit = state.active & ~stays_above & (falls_through | has_root)
-            hit, root, cell_exit, end_clearance = once((hit, root, cell_exit, end_clearance))
+            hit, root, cell_exit, end_clearance = barrier((hit, root, cell_exit, end_clearance))
             hit_distance = jnp.where(hit, state.distance + jnp.clip(root, 0.0, length), state.hit_distance)
             distance = jnp.where(stays_above, block_exit, cell_exit)
             active = state.active & ~hit & (distance < ray.exit_distance)

@@ -61,7 +61,7 @@ MAX_TRIANGLES = 1 << 28
 # Slack of the boxes of instances, in units of the floating-point precision and of their coordinates: rays are
 # transformed to coordinates of the mesh with rounding.
 _INSTANCE_ROUNDING = 16.0
-# Largest rounding of a corner: in units of the longest edge of its triangle, if it is more than so many m.
+# Largest rounding of a corner, in units of the longest edge of its triangle, and m that it may have anyway.
 _EDGE_ROUNDING, _LEAST_ROUNDING = 0.01, 1e-4
 # A mesh this far from its origin, m, and in units of its own size, lies there in coordinates of a map.
 _FAR_FROM_ORIGIN, _FAR_IN_SIZES = 1e3, 10.0

@@ -145,7 +145,7 @@ class Scene(eqx.Module):
             return voxels.voxel_size[:2] * np.array(voxels.shape[:2])
         if isinstance(self.ground, Terrain) and self.ground.sides == "periodic":
             return self.ground.spacing * np.array(self.ground.heights.shape)
-        # Of what a simulation leaves out meshes know the period.
+        # Meshes know the period of what a simulation leaves out.
         return self.meshes[0].period if self.meshes else None
 
     @property

@@ -41,7 +41,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxlidar._jax.mesh_axes import vary_with
-from jaxlidar._jax.one_function import once, one_function
+from jaxlidar._jax.one_function import barrier, one_function
 from jaxlidar._vectors import FAR, Scalar, Vec, cross, dot, scale, vec, with_derivative_of
 
 # Numbers in a row of the table.
@@ -61,7 +61,7 @@ _AREA_ROUNDING = 2.0
 _DISTANCE_ROUNDING, _MAX_RISE = 4.0, 100.0
 # Relative slack of the distances at which a ray leaves a box (Ize 2013, J. Comput. Graph. Tech. 2(2), 12).
 _BOX_ROUNDING = 8.0
-# Cells of a repeating scene through which a ray is followed: so many, that only rays which are level to one
+# Cells of a repeating scene through which a ray is followed: only rays which are level to one
 # part in thousands may meet a triangle farther away.
 MAX_PERIODS = 4096
 # Smallest cosine of incidence in derivatives: those of grazing rays are bounded.
@@ -421,12 +421,12 @@ def _next_cell(period: Array, walk: _CellWalk, w: Vec, precision: float) -> tupl
 
 
 def _visit_node(tree: TriangleTree, s: _TreeTraversal, any_hit: bool, precision: float) -> _TreeTraversal:
-    """Let the ray of each lane visit one node.
+    """Let each ray visit one node.
 
     1. Read the row of the node.
-    2. Of an inner node, intersect both boxes, and go on to the nearer one; the trail notes the other.
-    3. Of an instance, transform the ray, and go on to the root of its tree.
-    4. Of a triangle, intersect it. Of two in one plane, keep that with the lower number of material.
+    2. At an inner node, intersect both boxes, and go on to the nearer one; the trail notes the other.
+    3. At an instance, transform the ray, and go on to the root of its tree.
+    4. At a triangle, intersect it. Keep that with the lower number of material of two in one plane.
     5. Where nothing below is met, go on to the next node of the trail; at the end of a lower tree, to that of
        the upper tree; at the end of the latter, stop.
     6. Where the scene repeats and nothing was met, begin again in the next cell.
@@ -449,8 +449,8 @@ def _visit_node(tree: TriangleTree, s: _TreeTraversal, any_hit: bool, precision:
     boxes = [
         _box_distance(row[k : k + 3], row[k + 6 : k + 9], start, inverse, reach, precision) for k in (0, 3)
     ]
-    # Each number of the next state follows from these: without `once` the compiler repeats them in all.
-    (first_met, first_near), (second_met, second_near) = once(boxes)
+    # Each number of the next state follows from these: without `barrier` the compiler repeats them in all.
+    (first_met, first_near), (second_met, second_near) = barrier(boxes)
     descends = ~is_leaf & (first_met | second_met)
     takes_second = second_met & (~first_met | (second_near < first_near))
     # 3.
@@ -464,11 +464,11 @@ def _visit_node(tree: TriangleTree, s: _TreeTraversal, any_hit: bool, precision:
     # 4.
     distance, rounding = _triangle_distance(row, start, direction, instance.one_sided, precision)
     if s.material is None or s.rounding is None:
-        distance = once(distance)
+        distance = barrier(distance)
         is_nearer = s.active & s.inside & is_leaf & (distance < s.distance)
         material = nearest_rounding = None
     else:
-        distance, rounding = once((distance, rounding))
+        distance, rounding = barrier((distance, rounding))
         # Zero for the same material, and where nothing has been met.
         order = jnp.where(s.row > 0, jnp.sign(s.material - row[9]), 0.0)
         farthest = s.distance + order * (s.rounding + rounding)

@@ -7,21 +7,23 @@ meets the reference plane at
 
     p = (s_x, s_y) - H (w_x, w_y) / w_z,   zenith = atan2(hypot(w_x, w_y), -w_z),   azimuth = atan2(w_x, w_y).
 
-How a scanner on a moving platform comes to s and w is in `jaxlidar.instrument.trajectory`. Positions stay in
+How a scanner on a moving platform comes to s and w is in `jaxlidar.sensors.trajectory`. Positions stay in
 double precision, as map coordinates of millions of metres need.
 """
 
 import dataclasses
 import math
 import operator
-from typing import Any, final
+from collections.abc import Sequence
+from typing import Any, SupportsFloat, final
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import ArrayLike, Float, Int
+from jaxtyping import Float, Int
 
 from jaxlidar._fields.checks import (
+    Numbers,
     as_numpy,
     check_integer,
     check_kind,
@@ -103,15 +105,15 @@ class Survey(eqx.Module):
     def __init__(
         self,
         lidar: Lidar,
-        position: Any = None,
-        zenith: ArrayLike | Any | None = None,
-        azimuth: ArrayLike | Any | None = None,
-        altitude: ArrayLike | Any | None = None,
-        sensor: Any = None,
+        position: Numbers | None = None,
+        zenith: Numbers | None = None,
+        azimuth: Numbers | None = None,
+        altitude: Numbers | None = None,
+        sensor: Numbers | None = None,
         *,
-        gps_time: ArrayLike | Any | None = None,
-        scan_angle: ArrayLike | Any | None = None,
-        flight_line: ArrayLike | Any | None = None,
+        gps_time: Numbers | None = None,
+        scan_angle: Numbers | None = None,
+        flight_line: Numbers | None = None,
     ):
         check_kind("lidar", lidar, Lidar, "a Lidar, as in Survey(Lidar(), position=...)")
         position = _place(lidar, position, altitude, sensor)
@@ -257,7 +259,7 @@ class Survey(eqx.Module):
         middle = 0.5 * (self.position.min(axis=0) + self.position.max(axis=0))
         return self._lidar_at(middle, int(np.argmax(self.zenith)))
 
-    def about(self, origin: Float[np.ndarray, "2"]) -> "Survey":
+    def relative_to(self, origin: Float[np.ndarray, "2"]) -> "Survey":
         """Make the same survey with positions relative to `origin`, (2,) x and y in m."""
         origin = _horizontal_position("origin", origin)
         origin = np.pad(origin, (0, self.position.shape[1] - 2))
@@ -295,7 +297,7 @@ class Survey(eqx.Module):
         return self.slant_range * concrete_number(self.lidar.divergence) * 0.5e-3
 
     @staticmethod
-    def grid(lidar: Lidar, low: Any, high: Any, spacing: Any) -> "Survey":
+    def grid(lidar: Lidar, low: Numbers, high: Numbers, spacing: Numbers) -> "Survey":
         """Make a survey of a regular grid of footprints, row after row from the south-west.
 
         **Arguments:**
@@ -332,7 +334,13 @@ class Survey(eqx.Module):
 
     @staticmethod
     def track(
-        lidar: Lidar, start: Any, end: Any, spacing: Any, *, beams: int = 1, beam_spacing: Any = 600.0
+        lidar: Lidar,
+        start: Numbers,
+        end: Numbers,
+        spacing: SupportsFloat,
+        *,
+        beams: int = 1,
+        beam_spacing: SupportsFloat = 600.0,
     ) -> "Survey":
         """Make a survey of footprints along a line, of one beam or of several side by side as GEDI has.
 
@@ -373,13 +381,13 @@ class Survey(eqx.Module):
     def scan(
         lidar: Lidar,
         pattern: AbstractScan,
-        start: Any,
-        end: Any,
-        speed: Any,
-        pulse_rate: Any,
+        start: Numbers,
+        end: Numbers,
+        speed: SupportsFloat,
+        pulse_rate: SupportsFloat,
         *,
-        gps_time: Any = 0.0,
-        flight_line: Any = 1,
+        gps_time: SupportsFloat = 0.0,
+        flight_line: int = 1,
     ) -> "Survey":
         """Make a survey of the shots of a scanner on a level platform that flies along a line.
 
@@ -437,13 +445,13 @@ class Survey(eqx.Module):
 
     @staticmethod
     def fly(
-        trajectory: Any,
+        trajectory: Trajectory | Sequence[Trajectory],
         scan: AbstractScan | None = None,
         *,
         lidar: Lidar | None = None,
-        pulse_rate: Any = None,
-        mounting: Any = (0.0, 0.0, 0.0),
-        lever_arm: Any = (0.0, 0.0, 0.0),
+        pulse_rate: SupportsFloat | None = None,
+        mounting: Numbers = (0.0, 0.0, 0.0),
+        lever_arm: Numbers = (0.0, 0.0, 0.0),
         above: Any = None,
     ) -> "Survey":
         """Make a survey of the shots of a scanner on a platform that moves along a trajectory.
@@ -477,7 +485,7 @@ class Survey(eqx.Module):
         degrees from the vertical, or from below the reference plane, with a lidar that has an altitude;
         TypeError for objects of the wrong type.
 
-        **Source:** see `jaxlidar.instrument.trajectory` for the rotations.
+        **Source:** see `jaxlidar.sensors.trajectory` for the rotations.
 
         **Example:** a wing of 10 degrees down turns a beam straight down to the left.
 
@@ -664,7 +672,7 @@ def _count_along(length: float, step: float) -> int:
 
 
 def _check_number_of_shots(cause: str, shots: int) -> None:
-    """Refuse a survey that does not fit into memory. `cause`: the arguments that ask for so many shots."""
+    """Refuse a survey that does not fit into memory. `cause`: the arguments that ask for the shots."""
     memory = machine_memory()
     if shots * _BYTES_PER_SHOT > memory:
         raise ValueError(

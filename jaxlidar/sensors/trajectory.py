@@ -25,7 +25,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
-from jaxlidar._fields.checks import UnitWarning, as_numpy, check_range, warn_user
+from jaxlidar._fields.checks import Numbers, UnitWarning, as_numpy, check_range, warn_user
 from jaxlidar._text import number_text
 
 # Courses of two positions that are nearer to one another than this, m, are not defined.
@@ -70,7 +70,14 @@ class Trajectory(eqx.Module):
     pitch: Float[np.ndarray, " n"]
     yaw: Float[np.ndarray, " n"]
 
-    def __init__(self, time: Any, position: Any, roll: Any = 0.0, pitch: Any = 0.0, yaw: Any = None):
+    def __init__(
+        self,
+        time: Numbers,
+        position: Numbers,
+        roll: Numbers = 0.0,
+        pitch: Numbers = 0.0,
+        yaw: Numbers | None = None,
+    ):
         check_range("time", time)
         times = np.atleast_1d(as_numpy(time, "time"))
         if times.ndim != 1 or times.size == 0:
@@ -105,7 +112,7 @@ class Trajectory(eqx.Module):
         )
         return f"Trajectory of {len(self):,} time{'s' * (len(self) != 1)}: {spans}"
 
-    def at(self, time: Any) -> "Trajectory":
+    def at(self, time: Numbers) -> "Trajectory":
         """Return the trajectory at other times, between its own: linear in position and in each angle.
 
         **Arguments:** `time`: (shots,) s, strictly increasing, from the first to the last of the trajectory.

@@ -41,7 +41,7 @@ from jaxlidar.trace.photons.absorption import (
 )
 
 PHOTONS_PER_BATCH = 8192
-# A flight through a canopy with periodic sides is followed over at most so many heights of the canopy.
+# A flight through a canopy with periodic sides is followed over at most this many heights of the canopy.
 MAX_FLIGHT_HEIGHTS = 300.0
 
 
@@ -105,7 +105,7 @@ def energy_budget(
     - `illumination`: "beam" (default), or "parallel": light from the beam's direction over one period of a
       canopy with periodic sides.
     - `max_orders`: scatterings followed, at least 1; light that remains then is `unfollowed`. Default 10,000.
-    - `max_photons`: stop after so many, at least 1, whatever the error. Default 100,000,000.
+    - `max_photons`: stop after this number of photons, at least 1, whatever the error. Default 100,000,000.
     - `progress`: a function called with a `Progress` after every round; for instance `print`. Default None.
 
     An interrupt (Ctrl-C) after eight batches ends it with the batches that are done.

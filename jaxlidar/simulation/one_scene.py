@@ -25,7 +25,7 @@ from jaxlidar._fields.checks import (
 from jaxlidar._jax.mesh_axes import vary_with, with_automatic_axes
 from jaxlidar._jax.threads import side_by_side
 from jaxlidar._progress import Progress
-from jaxlidar._summary import NOTABLE_FRACTION, late_fraction, percent, unfollowed_message
+from jaxlidar._summary import NOTABLE_FRACTION, outside_fraction, percent, unfollowed_message
 from jaxlidar.planning.memory import MAX_APPLIED_WAVELENGTHS
 from jaxlidar.planning.orders import MAX_ORDERS, orders_to_tolerance
 from jaxlidar.planning.plan import MIN_BATCHES, Plan
@@ -51,7 +51,7 @@ from jaxlidar.spectral.apply_optics import BudgetTerms, budget_excess, refuse_ex
 from jaxlidar.spectral.waveform import Waveform, open_at_first_return
 from jaxlidar.trace.response import Response, trace_device_scene
 
-# A batch has at most so many photons, because it cannot be interrupted. Within a JAX transformation, which
+# A batch has at most this many photons, because it cannot be interrupted. Within a JAX transformation, which
 # cannot be interrupted at all, it may have more.
 MAX_BATCH_PHOTONS = 65_536
 
@@ -305,10 +305,10 @@ def _make_waveform(tracer: BatchTracer, result: _BatchResults, goal: _Goal) -> W
     wave = dataclasses.replace(
         wave, info={**result.info, "altitude": None if lidar.altitude is None else float(lidar.altitude)}
     )
-    if plan.scope.automatic_window and late_fraction(wave) >= NOTABLE_FRACTION:
+    if plan.scope.automatic_window and outside_fraction(wave) >= NOTABLE_FRACTION:
         end = plan.sample_start + plan.sample_interval * plan.n_samples
         warn_user(
-            f"{percent(late_fraction(wave))} of the light is still on its way when the record ends at "
+            f"{percent(outside_fraction(wave))} of the light is still on its way when the record ends at "
             f"{end:.4g} ns: give window=, or see Waveform.energy_budget",
             LateLightWarning,
         )

@@ -66,7 +66,7 @@ from jaxlidar.trace.first.footprint import bistatic_beam
 from jaxlidar.trace.photons.histories import Histories
 from jaxlidar.trace.response import trace_first, trace_higher
 
-# Light is followed over paths as long as light takes so many ns.
+# Light is followed over paths that take light up to this time, ns.
 _LONGEST_PATH_TIME = 2000.0
 # The sensor is so high, m, that no scene reaches up to it.
 _ALTITUDE = 1e6
@@ -463,7 +463,7 @@ def _trace_batch(
         # The first order knows its own path back.
         first = trace_first(scene, key)
         returned += of_wavelengths(jnp.sum(first.weights, axis=-1) + first.outside, scene.first_histories)
-    unfollowed = of_wavelengths(higher.late + higher.remaining, scene.histories)
+    unfollowed = of_wavelengths(higher.flown_outside + higher.unfollowed, scene.histories)
     return returned / sun[2], unfollowed
 
 

@@ -184,7 +184,7 @@ def _sample_bins(scene: DeviceScene, model: WaveformModel) -> TimeBins:
     # Models of simulations have samples of whole fine bins.
     assert isinstance(model.convolution, PulseConvolution)
     fine, bins_per_sample = scene.bins, model.convolution.bins_per_sample
-    # A ray segment spans at most so many fine bins.
+    # A ray segment spans at most this many fine bins.
     longest = fine.max_span - 2
     max_span = -(-longest // bins_per_sample) + 3
     samples = TimeBins(0.0, 1.0, model.time.size, max_span)

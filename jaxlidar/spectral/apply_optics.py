@@ -43,7 +43,7 @@ from jaxlidar.spectral.pulse_convolution import (
 from jaxlidar.trace.photons.histories import Histories, histories
 from jaxlidar.trace.response import Response
 
-# Programs have room for at least so many wavelengths.
+# Programs have room for at least this many wavelengths.
 MIN_WAVELENGTHS = 4
 # Size buckets of samples from one power of two to the next: surveys pay for each sample.
 SAMPLE_BUCKETS = 4
@@ -73,7 +73,7 @@ class WaveformModel(eqx.Module):
     - `one_order`: True if one order is followed. `can_scatter_again`: True if scattered light can meet the
       scene.
     - `pivots`: wavelengths at which histories are summed, and interpolated to all; None: at all.
-    - `batches`: the response is the sum of so many; samples are those of their mean. None: it is one.
+    - `batches`: number of batches whose responses are summed; samples are those of their mean. None: one.
     """
 
     optics: Float[Array, "channels wavelengths"]
@@ -152,7 +152,7 @@ class WaveformModel(eqx.Module):
         return dataclasses.replace(self, first_degree=0, degree=0)
 
     def for_sum_of(self, batches: Float[Array, ""]) -> "WaveformModel":
-        """Return the model of the sum of the responses of so many batches."""
+        """Return the model of the sum of the responses of a number of batches."""
         return dataclasses.replace(self, batches=batches)
 
     @property
@@ -243,7 +243,7 @@ def make_free_sampling_model(setup: Setup, n_samples: int) -> WaveformModel:
 def make_padded_waveform_model(setup: Setup) -> WaveformModel:
     """Make the waveform model of a setup, with sizes and wavelengths rounded up to size buckets.
 
-    Of a spectrum only the wavelengths are: applying optics takes longer there than compiling it again.
+    Only the wavelengths of a spectrum are: applying optics takes longer there than compiling it again.
     """
     plan, n_wavelengths = setup.plan, setup.lidar.wavelength.size
     if n_wavelengths > MAX_EXACT_WAVELENGTHS:
@@ -492,27 +492,27 @@ def refuse_excess(excess: Float[Any, "*shots"]) -> None:
 class ResponseSums(NamedTuple):
     """Sums of a response with optics applied, (wavelengths,) each.
 
-    - `returned`, `lost`: apparent reflectance within all fine bins, and before and after them.
+    - `returned`, `returned_outside`: apparent reflectance within all fine bins, and before and after them.
     - `relative_energy`: of what returned (see `relative_energy_samples`).
-    - `absorbed`: by each material; (materials, wavelengths). - `escaped`, `late`, `remaining`: energy that
-      the budget lists as "escaped", "after the window" and "unfollowed".
+    - `absorbed`: by each material; (materials, wavelengths). - `escaped`, `flown_outside`, `unfollowed`:
+      energy that the budget lists as "escaped", "after the window" and "unfollowed".
     """
 
     returned: Float[Array, "wavelengths"]
-    lost: Float[Array, "wavelengths"]
+    returned_outside: Float[Array, "wavelengths"]
     relative_energy: Float[Array, "wavelengths"]
     absorbed: Float[Array, "materials wavelengths"]
     escaped: Float[Array, "wavelengths"]
-    late: Float[Array, "wavelengths"]
-    remaining: Float[Array, "wavelengths"]
+    flown_outside: Float[Array, "wavelengths"]
+    unfollowed: Float[Array, "wavelengths"]
 
 
 def sum_response(response: Response, model: WaveformModel) -> ResponseSums:
     """Sum a response over bins, with optics applied.
 
     1. Order one has a table of histories of its own: what it returns, within all fine bins and outside.
-    2. All else in one product: escaped, late and remaining energy, and what each material absorbs, which is
-       the energy that arrived there less that which departed.
+    2. All else in one product: energy that escaped, flew on outside of the record or was not followed, and
+       what each material absorbs, which is the energy that arrived there less that which departed.
     3. What higher orders return, if they are followed, is added to order one.
     """
     first_table = model.first_histories
@@ -531,21 +531,23 @@ def sum_response(response: Response, model: WaveformModel) -> ResponseSums:
         returned, relative_energy = jnp.moveaxis(jnp.sum(by_material, axis=1), -1, 0)
         return [returned, jnp.sum(outside, axis=1), relative_energy]
 
-    returned, lost, relative_energy = sums(
+    returned, returned_outside, relative_energy = sums(
         rows_of_returns(response.first, response.first_outside), first_table
     )
-    rows = [response.escaped, response.late, response.remaining]
+    rows = [response.escaped, response.flown_outside, response.unfollowed]
     if response.higher is not None and response.higher_outside is not None:
         rows += rows_of_returns(response.higher, response.higher_outside)
     absorbed_weights = response.arrived - response.departed
     materials = [absorbed_weights[:, m] for m in range(absorbed_weights.shape[1])]
     totals, n_rows = sums([*rows, *materials], table), len(rows)
-    (escaped, late, remaining), higher, absorbed = totals[:3], totals[3:n_rows], totals[n_rows:]
+    (escaped, flown_outside, unfollowed), higher, absorbed = totals[:3], totals[3:n_rows], totals[n_rows:]
     if len(higher):
-        higher_returned, higher_lost, higher_relative_energy = higher
-        returned, lost = returned + higher_returned, lost + higher_lost
+        higher_returned, higher_outside, higher_relative_energy = higher
+        returned, returned_outside = returned + higher_returned, returned_outside + higher_outside
         relative_energy = relative_energy + higher_relative_energy
-    return ResponseSums(returned, lost, relative_energy, absorbed, escaped, late, remaining)
+    return ResponseSums(
+        returned, returned_outside, relative_energy, absorbed, escaped, flown_outside, unfollowed
+    )
 
 
 def budget_terms(response: Response, model: WaveformModel) -> BudgetTerms:
@@ -556,7 +558,7 @@ def budget_terms(response: Response, model: WaveformModel) -> BudgetTerms:
 def _energy_fractions(sums: ResponseSums, model: WaveformModel) -> dict[str, Float[Array, "wavelengths"]]:
     """Return energies by name from the sums of a response, or from those of its standard errors.
 
-    What returned is still part of what escaped, or remained unfollowed.
+    What returned is still part of what escaped, or was not followed.
     """
     lidar = model.lidar
     return {
@@ -565,8 +567,8 @@ def _energy_fractions(sums: ResponseSums, model: WaveformModel) -> dict[str, Flo
         "returned": sums.relative_energy * lidar.aperture_area / (jnp.pi * lidar.range_to_reference**2),
         "escaped": sums.escaped,
         **{f"absorbed by {name}": sums.absorbed[i] for i, name in enumerate(model.materials)},
-        "after the window": sums.late,
-        "unfollowed": sums.remaining,
+        "after the window": sums.flown_outside,
+        "unfollowed": sums.unfollowed,
     }
 
 
@@ -595,8 +597,9 @@ def budget_of_sums(sums: ResponseSums, model: WaveformModel) -> BudgetTerms:
     unfollowed = jnp.zeros_like(sums.returned) if model.one_order else budget["unfollowed"]
     # What a plan that does not cover the scene leaves out is not known: all light of a white surface, and no
     # less than what was found, as mirrors return more.
-    lost = jnp.where(model.is_covered, sums.lost, jnp.maximum(sums.returned + sums.lost, 1.0))
-    return BudgetTerms(budget, unfollowed * jnp.clip(return_per_energy, 1.0, 4.0), lost)
+    white = jnp.maximum(sums.returned + sums.returned_outside, 1.0)
+    outside = jnp.where(model.is_covered, sums.returned_outside, white)
+    return BudgetTerms(budget, unfollowed * jnp.clip(return_per_energy, 1.0, 4.0), outside)
 
 
 def samples_and_budget(

@@ -24,7 +24,7 @@ from jaxlidar._jax.products import einsum
 _N_POLYNOMIALS = 64
 # Norm of the residual of any column, of the norm 1, at which the decomposition stops.
 _RELATIVE_RESIDUAL = 1e-5
-# Programs are compiled for multiples of so many pivots.
+# Programs are compiled for multiples of this number of pivots.
 _PIVOT_BUCKET = 16
 
 

@@ -21,7 +21,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxlidar._fields.checks import as_array
-from jaxlidar._jax.one_function import once
+from jaxlidar._jax.one_function import barrier
 from jaxlidar._jax.products import einsum
 from jaxlidar._jax.programs import Program
 from jaxlidar.planning.config import KERNEL_VARIANCE
@@ -52,7 +52,7 @@ class PulseConvolution(eqx.Module):
         samples, bins = np.arange(self.n_samples)[None, :], np.arange(self.n_bins)[:, None]
         # Optimisation barriers: fused into the gather, the pulse would be computed again for every element;
         # and the matrix for every product, in place of once for all shots of a survey.
-        return once(once(self.fractions)[samples * self.bins_per_sample - bins - self.first_offset])
+        return barrier(barrier(self.fractions)[samples * self.bins_per_sample - bins - self.first_offset])
 
     def __call__(self, fine: Float[Array, "*s bins"]) -> Float[Array, "*s samples"]:
         """Return the samples of returns in fine bins."""
@@ -79,7 +79,7 @@ class PulseConvolution(eqx.Module):
         padded = jnp.pad(fine, [(0, 0)] * (fine.ndim - 1) + [(before, after)])
         blocks = padded[..., skipped : skipped + length].reshape(*fine.shape[:-1], n_tiles + 1, block)
         # Step 2. Optimisation barrier: padding in the product's own kernel takes longer than the product.
-        products = einsum("...b,bps->...ps", once(blocks), self._tile_matrices(n_tile))
+        products = einsum("...b,bps->...ps", barrier(blocks), self._tile_matrices(n_tile))
         # Step 3.
         tiles = products[..., :-1, 0, :] + products[..., 1:, 1, :]
         return tiles.reshape(*fine.shape[:-1], n_tiles * n_tile)[..., : self.n_samples]
@@ -90,9 +90,9 @@ class PulseConvolution(eqx.Module):
         bins = np.arange(block)[:, None, None] + block * np.arange(2)[None, :, None]
         index = np.arange(n_tile)[None, None, :] * self.bins_per_sample - bins + width - 1
         in_band = (index >= 0) & (index < width)
-        fractions = once(self.fractions)[np.clip(index, 0, width - 1)]
+        fractions = barrier(self.fractions)[np.clip(index, 0, width - 1)]
         # Optimisation barriers as in `matrix`.
-        return once(jnp.where(in_band, fractions, 0.0))
+        return barrier(jnp.where(in_band, fractions, 0.0))
 
 
 def pulse_convolution(

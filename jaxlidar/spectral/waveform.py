@@ -66,10 +66,10 @@ class Waveform(eqx.Module):
     - `energy_budget_stderr`: dict like `energy_budget`, one standard error each; zero where nothing was
       random.
     - `lost`: (wavelengths,) apparent reflectance, of light that reaches the sensor, that arrives before or
-      after all fine bins of the plan, as late multiple scattering. Within a JAX transformation, where a plan
-      that does not cover the lidar and the scene cannot be refused, it is 1 at least for these: the waveform
-      is then wrong, as rays may start below a surface. Light that is still in the scene at the end of the
-      record is "after the window" in `energy_budget` instead.
+      after all fine bins of the plan, as light does that is scattered many times. Within a JAX
+      transformation, where a plan that does not cover the lidar and the scene cannot be refused, it is 1 at
+      least for these: the waveform is then wrong, as rays may start below a surface. Light that is still in
+      the scene at the end of the record is "after the window" in `energy_budget` instead.
     - `recorded`: (wavelengths, samples) J that the receiver records of `energy`, without noise: background
       added, saturated, cut at the detection threshold, quantised. `jaxlidar.record` draws noise as well.
     - `wavelength`: (wavelengths,) nm, the lidar's.

@@ -37,17 +37,17 @@ _GRID_OF_SHOT_TALLIES = 0.01
 # Coefficients below this fraction of rtol, relative to the largest coefficient, do not count. They lie at the
 # rim of the footprint; without them its energy changes by less than 0.1 % where rtol is 0.1.
 _FAINT_OF_RTOL = 0.01
-# Batches of a footprint that shares light are many and small: they have so many times fewer photons and rays
-# than those of a shot traced alone. Of rays even half add little to the error.
+# Batches of a footprint that shares light are many and small: they have fewer photons and rays than
+# those of a shot traced alone, by these factors. Even half of the rays add little to the error.
 _PHOTONS_DIVISOR, _RAYS_DIVISOR = 4.0, 2.0
 # Tallied by shot, a batch costs something for every shot, and photons cost more: batches have as many photons
 # as those of a shot traced alone.
 _PHOTONS_DIVISOR_OF_SHOT_TALLIES = 1.0
-# Sharing pays where so many footprints overlap in the mean, by either tally, and shots are so many.
+# Sharing pays where at least this many footprints overlap in the mean, by either tally, for this many shots.
 _MIN_OVERLAP, _MIN_OVERLAP_OF_SHOT_TALLIES, _MIN_SHOTS = 1.3, 2.0, 4
-# A few rays resolve the edges of voxels in footprints that meet so many columns of them (see `per_shot`).
+# A few rays resolve the edges of voxels in footprints that meet this many columns of them (see `per_shot`).
 _COLUMNS_WITH_FEW_EDGES = 2.0
-# ... seen at zenith angles of at most so many degrees.
+# ... seen at zenith angles of at most this many degrees.
 _STEEP_ZENITH = 60.0
 # Numbers of rays and of photons of a batch are powers of two in these ranges: surveys share compiled
 # programs.
@@ -81,7 +81,9 @@ def choose_strategy(
     # Coordinates are relative to the survey's middle, where single precision is fine. A scene that cannot be
     # moved keeps its coordinates, and the lidar its position.
     lidar, _ = move_aim_to_origin(middle, scene)
-    relative_survey = survey.about((concrete_array(middle.position) - concrete_array(lidar.position))[:2])
+    relative_survey = survey.relative_to(
+        (concrete_array(middle.position) - concrete_array(lidar.position))[:2]
+    )
     strategy = _shared_illumination(relative_survey, setup, rtol, kept_names, shared)
     if strategy is not None:
         return strategy

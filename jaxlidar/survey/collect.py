@@ -258,19 +258,19 @@ def _waveforms(strategy: AbstractStrategy, fields: dict[str, Any], info: dict[st
     )
 
 
-def _warn_of_missing_light(strategy: AbstractStrategy, late: np.ndarray, unfollowed: np.ndarray) -> None:
+def _warn_of_missing_light(strategy: AbstractStrategy, outside: np.ndarray, unfollowed: np.ndarray) -> None:
     """Warn if much light of a shot is after the record, or may be in orders that were not followed.
 
-    `late`, `unfollowed`: (shots,), those of `MISSING_LIGHT`.
+    `outside`, `unfollowed`: (shots,), `late` and `unfollowed` of `MISSING_LIGHT`.
     """
     plan = strategy.setup.plan
-    most_late, most_unfollowed = (float(np.max(a, initial=0.0)) for a in (late, unfollowed))
+    most_outside, most_unfollowed = (float(np.max(a, initial=0.0)) for a in (outside, unfollowed))
     if plan.scope.automatic_orders and most_unfollowed > strategy.rtol:
         warn_user(unfollowed_message(plan.orders, most_unfollowed), UnfollowedLightWarning)
-    if most_late >= NOTABLE_FRACTION:
+    if most_outside >= NOTABLE_FRACTION:
         end = plan.sample_start + plan.sample_interval * plan.n_samples
         warn_user(
-            f"{percent(most_late)} of the light of a shot is still on its way when the record ends at "
+            f"{percent(most_outside)} of the light of a shot is still on its way when the record ends at "
             f"{end:.4g} ns: see Waveforms.energy_budget",
             LateLightWarning,
         )

@@ -133,7 +133,7 @@ def ground_position(survey: Survey, scene: Scene) -> Float[np.ndarray, "shots 3"
     origin = 0.5 * (survey.position[:, :2].min(axis=0) + survey.position[:, :2].max(axis=0))
     moved: Any = ground.moved(-origin)
     if moved is not None:
-        survey, ground = survey.about(origin), moved
+        survey, ground = survey.relative_to(origin), moved
     start_distance = AIM_DISTANCE
     if not survey.has_sensor_position:
         # Both bounds of every line, which a shape may return at different lines.

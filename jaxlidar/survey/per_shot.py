@@ -85,9 +85,9 @@ _RAYS_SIDE_BY_SIDE = 512
 # Batches of a shot follow one another, so that steps could be as small as one. The error is looked at after
 # every fourth: an estimate that stops at the first moment at which it seems precise is wrong more often.
 _BATCH_STEPS = StepRule(max_growth=1.0, min_step=4)
-# Lattices of at most so many rays are those of narrow footprints ...
+# Lattices of at most this many rays are those of narrow footprints ...
 _NARROW_RAYS = 64
-# ... which are traced in parts of so many rays, for so many shots together ...
+# ... which are traced in parts of this many rays, for this many shots together ...
 RAYS_OF_PART, _SHOTS_AT_ONCE = 8, 8
 # ... with as many parts in the first round that about three rays of all lattices meet what covers the
 # fraction `rtol` of a footprint. Shots of which no ray meets an edge of a crown seem exact: with fewer rays,
@@ -178,7 +178,7 @@ def make_survey_context(setup: Setup) -> SurveyContext:
 
 
 def shots_to_trace(n_shots: int) -> int:
-    """Return the number of shots that a program for a chunk of so many has room for: a size bucket."""
+    """Return the number of shots that a program for a chunk of `n_shots` has room for: a size bucket."""
     return size_bucket(n_shots, 1)
 
 
@@ -462,7 +462,7 @@ def _trace_narrow_shots(
 
     In each round:
 
-    1. Of each shot that is pending, find how many parts its lattices get: in the first round by the
+    1. Find how many parts the lattices of each pending shot get: in the first round by the
        tolerance, then by its error.
     2. Trace the pending shots, several at a time, and replace their results.
     """
@@ -524,8 +524,7 @@ def _trace_together(
 
     1. List the parts of all lattices of all shots, shot by shot.
     2. Trace them, a block of parts at a time, and add them to the tally of their lattices.
-    3. Of each shot: apply optics and pulse to the lattices, whose scatter tells the errors, and to their
-       mean.
+    3. Apply optics and pulse to the lattices of each shot, whose scatter tells the errors, and to their mean.
     """
     # Step 1. The list ends, for each shot, at:
     ends = jnp.cumsum(n_parts * MIN_BATCHES)

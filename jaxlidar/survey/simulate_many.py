@@ -92,9 +92,9 @@ def simulate_many(
     - `survey`: a `Survey`.
     - `scene`: a `Scene`; or `SceneParts`, for one that is larger than memory.
     - `key`: a JAX random key. The same key gives the same waveforms.
-    - `rtol`: relative error to reach for every shot, in (0, 1). Default None: 0.01. Of narrow shots at first
-      order, what covers less than a tenth of `rtol` of a footprint may be met by no ray, and is then not in
-      the standard error.
+    - `rtol`: relative error to reach for every shot, in (0, 1). Default None: 0.01. In narrow shots
+      at first order, what covers less than a tenth of `rtol` of a footprint may be met by no ray, and is then
+      not in the standard error.
     - `max_orders`: follow exactly this many scatterings, whatever `rtol` needs; at least 1. Default None:
       from `rtol` and the optics.
     - `path`: a Zarr store, whose name ends in ".zarr", for the waveforms as they come, with their case, so

@@ -188,7 +188,7 @@ class TiledSceneStrategy(AbstractStrategy):
             scene_part, plan = strategy.setup.scene, strategy.setup.plan
             off_map_fractions[tile.shots] = off_map(strategy.survey, scene_part)
             heights[tile.shots] = ground_heights(strategy.survey, scene_part, plan.limits.start_distance)
-            # Of the part as it is given: the strategy's has been moved to the survey's origin.
+            # The part as it is given: the strategy's has been moved to the survey's origin.
             digests.append(digest_of(scene.between(tile.low, tile.high)))
             materials |= dict.fromkeys(plan.config.materials)
             surfaces |= dict.fromkeys(plan.config.materials[s.material] for s in plan.config.surfaces)

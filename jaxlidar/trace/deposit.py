@@ -17,7 +17,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float, Int
 
-from jaxlidar._jax.one_function import once
+from jaxlidar._jax.one_function import barrier
 from jaxlidar.planning.config import KERNEL_BINS, TimeBins
 
 
@@ -29,7 +29,7 @@ def bspline_row(
     **Returns:** index of the first bin, counting the margin, and the values in three bins from there on.
     """
     # Optimisation barrier: fused into the row, both would be computed again for each of its bins.
-    position, value = once((bins.position(time), value))
+    position, value = barrier((bins.position(time), value))
     lowest = jnp.round(lax.stop_gradient(position) - 0.5 * (KERNEL_BINS - 1))
     # Offset from the middle bin, in [-1/2, 1/2].
     r = position - lowest - 1.0

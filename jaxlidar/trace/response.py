@@ -60,8 +60,8 @@ class Response(eqx.Module):
       returns before the first bin or after the last.
     - `arrived`, `departed`: (traces, materials, histories) weight that reached each material, and that went
       on from it.
-    - `escaped`, `late`, `remaining`: (traces, histories) weight that left the scene, that outlasted the
-      window, and that was still in flight after the last order.
+    - `escaped`, `flown_outside`, `unfollowed`: (traces, histories) weight that left the scene, that
+      outlasted the window, and that was still in flight after the last order.
 
     **Example:**
 
@@ -82,8 +82,8 @@ class Response(eqx.Module):
     arrived: Float[Array, "*shots traces materials histories"]
     departed: Float[Array, "*shots traces materials histories"]
     escaped: Float[Array, "*shots traces histories"]
-    late: Float[Array, "*shots traces histories"]
-    remaining: Float[Array, "*shots traces histories"]
+    flown_outside: Float[Array, "*shots traces histories"]
+    unfollowed: Float[Array, "*shots traces histories"]
 
 
 @with_automatic_axes
@@ -182,8 +182,8 @@ def apply_optics_to_first(response: Response, scene: DeviceScene) -> Response:
         arrived=apply(response.arrived, 1),
         departed=apply(response.departed, 1),
         escaped=apply(response.escaped, 0),
-        late=apply(response.late, 0),
-        remaining=apply(response.remaining, 0),
+        flown_outside=apply(response.flown_outside, 0),
+        unfollowed=apply(response.unfollowed, 0),
     )
 
 
@@ -243,8 +243,8 @@ def join_orders(first: FirstOrderResponse, higher: HigherOrderTally) -> Response
         arrived=higher.arrived,
         departed=higher.departed,
         escaped=higher.escaped,
-        late=higher.late,
-        remaining=higher.remaining,
+        flown_outside=higher.flown_outside,
+        unfollowed=higher.unfollowed,
     )
 
 
@@ -295,7 +295,7 @@ def _pull_back_first(
     of_first, of_weights = cotangents
     of_first = dataclasses.replace(of_first, weights=of_first.weights + of_weights)
     tables = pull_back_first_order(scene, *_footprint_rays(scene, *footprint), of_first)
-    # Of the rays to a mirror nothing counts but what returns.
+    # Nothing but what returns counts of the rays to a mirror.
     of_mirrored = dataclasses.replace(jax.tree.map(jnp.zeros_like, of_first), weights=of_weights)
     for i in _returning_mirrors(scene):
         rays = mirror_rays(scene.beam, scene.surfaces[i])
@@ -337,12 +337,12 @@ def first_order_response(
     scene: DeviceScene, first: FirstOrder, weights: Float[Array, "materials first_histories bins"]
 ) -> Response:
     """Make the response where nothing is followed beyond the first scattering."""
-    departed, escaped, remaining = fates_after_first_scattering(
+    departed, escaped, unfollowed = fates_after_first_scattering(
         scene, first.arrived, first.scattered, first.escaped
     )
-    # No light is late: none is followed beyond its first scattering.
-    budget = (first.arrived, departed, escaped, jnp.zeros_like(remaining), remaining)
-    arrived, departed, escaped, late, remaining = (a[None] for a in budget)
+    # No light flies on outside of the record: none is followed beyond its first scattering.
+    budget = (first.arrived, departed, escaped, jnp.zeros_like(unfollowed), unfollowed)
+    arrived, departed, escaped, flown_outside, unfollowed = (a[None] for a in budget)
     return Response(
         first=weights[None],
         higher=None,
@@ -351,8 +351,8 @@ def first_order_response(
         arrived=arrived,
         departed=departed,
         escaped=escaped,
-        late=late,
-        remaining=remaining,
+        flown_outside=flown_outside,
+        unfollowed=unfollowed,
     )
 
 
@@ -362,14 +362,14 @@ def fates_after_first_scattering(
     scattered: Float[Array, "materials histories"],
     escaped: Float[Array, "histories"],
 ) -> tuple[Float[Array, "materials histories"], Float[Array, "histories"], Float[Array, "histories"]]:
-    """Return what departs from each material, what escapes, and what remains unfollowed.
+    """Return what departs from each material, what escapes, and what is not followed.
 
     1. For each material and channel: the light that it scatters departs with the next history.
-    2. That light remains unfollowed, unless it went straight through a plate.
+    2. That light is not followed, unless it went straight through a plate.
     3. What one plane alone scatters escapes, as nothing is in its path.
     """
     config, histories = scene.config, scene.first_histories
-    departed, remaining = jnp.zeros_like(arrived), jnp.zeros_like(escaped)
+    departed, unfollowed = jnp.zeros_like(arrived), jnp.zeros_like(escaped)
     scatterers = [(s, False) for s in (config.leaf, config.bark) if s is not None]
     scatterers += [(s, surface.straight) for s, surface in zip(config.surfaces, scene.surfaces)]
     for scatterer, is_straight in scatterers:
@@ -384,8 +384,8 @@ def fates_after_first_scattering(
             departed = departed.at[scatterer.material, after].add(weight)
             # Light that goes straight through a plate was followed to what lies behind it.
             if not (is_straight and channel == scatterer.transmission):
-                remaining = remaining.at[after].add(weight)
+                unfollowed = unfollowed.at[after].add(weight)
     lights_itself = any(surface.lights_itself for surface in scene.surfaces)
     if len(scatterers) == 1 and not (config.leaf or config.bark or lights_itself):
-        return departed, escaped + remaining, jnp.zeros_like(remaining)
-    return departed, escaped, remaining
+        return departed, escaped + unfollowed, jnp.zeros_like(unfollowed)
+    return departed, escaped, unfollowed

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 import jaxlidar as jl
-from jaxlidar._jax.one_function import one_function
-from jaxlidar.extend import once
+from jaxlidar._jax.one_function import barrier, one_function
 from jaxlidar.trace.march.voxel_traversal import make_medium, march_to_depths
 
 KEY = jax.random.key(0)
@@ -84,19 +83,19 @@ def shared(x, hold):
 
 @pytest.mark.skipif(jax.default_backend() != "cpu", reason="kernels of processors")
 def test_values_are_computed_once():
-    """With the optimisation barrier `once`; without it, older compilers compute them for each result."""
+    """With the optimisation barrier; without it, older compilers compute them for each result."""
 
     def count(hold):
         return jax.jit(lambda x: shared(x, hold)).lower(jnp.ones(4096)).compile().as_text().count(" abs(")
 
-    assert count(once) == 1
+    assert count(barrier) == 1
     assert jax.__version_info__ >= (0, 12) or count(lambda y: y) > 1
 
 
 def test_values_computed_once_have_their_derivatives():
     x = jnp.linspace(0.5, 2.0, 16)
     plain, held = (
-        lambda x, h=h: jnp.sum(jnp.stack([jnp.sum(a) for a in shared(x, h)])) for h in (lambda y: y, once)
+        lambda x, h=h: jnp.sum(jnp.stack([jnp.sum(a) for a in shared(x, h)])) for h in (lambda y: y, barrier)
     )
     np.testing.assert_allclose(held(x), plain(x), rtol=1e-6)
     np.testing.assert_allclose(jax.grad(held)(x), jax.grad(plain)(x), rtol=1e-5)

@@ -16,10 +16,7 @@ SCRIPTS = sorted(
     p.stem for p in FOLDER.glob("*.py") if not p.stem.startswith("_") and p.stem != "make_readme"
 )
 # Modules in the folders of examples: a name may stand for several files, so imports must not be kept.
-EXAMPLE_MODULES = (
-    *("_airborne", "_common", "_crown", "_recorded", "_validation", "_waveforms", "fit_airborne"),
-    *("fit_gedi", "peers", "simulation_cost"),
-)
+EXAMPLE_MODULES = (*("_common", "_crown", "_validation", "_waveforms", "peers", "simulation_cost"),)
 
 
 @pytest.fixture

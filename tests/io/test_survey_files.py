@@ -50,7 +50,7 @@ def test_waveforms_are_saved_with_their_case_and_with_no_other(waveforms, tmp_pa
         ValueError, match=r"survey\.nc: /case: no such attribute: it was saved without its case"
     ):
         jl.rerun(path)
-    elsewhere = dataclasses.replace(case, survey=SURVEY.about(np.ones(2)))
+    elsewhere = dataclasses.replace(case, survey=SURVEY.relative_to(np.ones(2)))
     for wrong_case, message in (
         (elsewhere, "the shots of the case have another position"),
         (jl.io.Case(jl.Lidar(), SCENE, KEY), "a case with a survey belongs to Waveforms"),

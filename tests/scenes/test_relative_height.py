@@ -12,7 +12,7 @@ LEAF = jl.LeafOptics(0.4, 0.4)
 
 
 def canopy(z=0.0, layers=10, **arguments):
-    """Return a canopy of 4 x 4 m and so many layers of 1 m, whose lowest one begins at the height z, m."""
+    """Return a canopy of 4 x 4 m with layers of 1 m, whose lowest one begins at the height z, m."""
     lad = np.ones((4, 4, layers))
     return jl.Canopy(jl.VoxelMap.from_lad(lad, voxel_size=1.0, origin=(0.0, 0.0, z)), leaf=LEAF, **arguments)
 

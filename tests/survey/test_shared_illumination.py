@@ -71,18 +71,18 @@ def test_standard_errors_of_the_energy_budget_are_those_of_its_sums():
     sums = {
         "returned": 0.4,
         "relative_energy": 0.4,
-        "lost": 0.0,
+        "returned_outside": 0.0,
         "escaped": 0.5,
-        "late": 0.1,
-        "remaining": 0.1,
+        "flown_outside": 0.1,
+        "unfollowed": 0.1,
     }
     stderr = {
         "returned": 0.2,
         "relative_energy": 0.2,
-        "lost": 0.0,
+        "returned_outside": 0.0,
         "escaped": 0.0,
-        "late": 0.03,
-        "remaining": 0.04,
+        "flown_outside": 0.03,
+        "unfollowed": 0.04,
     }
     energy, energy_stderr = (
         {**{name: np.full((1, 1), x) for name, x in values.items()}, "absorbed": np.full((1, 1, 1), 0.05)}

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import jaxlidar as jl
+from jaxlidar.spectral.truth_class import Truth
 from tests.quick_compilation import optimise_programs
 from tests.survey.test_simulate_many import stored_shots
 
@@ -115,7 +116,7 @@ def test_damaged_files_are_refused(waveforms, tmp_path):
 
 def test_truths_are_one_truth_with_an_axis_of_shots(waveforms, tmp_path):
     truth = waveforms.truth
-    assert isinstance(truth, jl.Truth)
+    assert isinstance(truth, Truth)
     assert truth.time.shape == waveforms.time.shape
     assert truth.height.shape == truth.gap_probability.shape == (11, waveforms.time.size)
     assert same(truth[-2], waveforms[9].truth)

@@ -15,7 +15,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxlidar._jax.one_function import once
+from jaxlidar._jax.one_function import barrier
 
 
 class ExtinctionSlopes(eqx.Module):
@@ -95,7 +95,7 @@ class ExtinctionSlopes(eqx.Module):
         """Add a segment to derivatives of optical depths; `length`, m, of it lies before each end."""
         slopes, parameters = self.slopes_at(cell, projection_factor), self.parameters_at(cell)
         # Optimisation barrier: inside the march, fused slopes would be gathered again for every target.
-        slopes, length = once((slopes, length))
+        slopes, length = barrier((slopes, length))
         if self.parameter_index is None:
             return depth_slopes + jnp.stack(slopes)[None] * length[:, None]
         numbers = jnp.arange(self.count, dtype=jnp.int32)[None, :, None]
@@ -180,4 +180,4 @@ def outer_rows(
 ) -> Float[Array, "rows bins parameters"]:
     """Return the products of a row's bins and its slopes."""
     # Optimisation barrier: fused into the rows, slopes would be computed again for each bin.
-    return bin_values[:, :, None] * once(slopes)[:, None, :]
+    return bin_values[:, :, None] * barrier(slopes)[:, None, :]

@@ -9,7 +9,7 @@ respect to the extinction k_v of voxel v is (`trace.derivatives.score_functions`
 
 Hence a flight and its collision count with the sum of all deposits from there on:
 
-1. Photons are traced once more, from the same random numbers. Of every flight its ends are kept, with their
+1. Photons are traced once more, from the same random numbers. The ends of every flight are kept, with their
    deposits D (`KeptFlights`).
 2. The flights are taken from the last to the first, and the deposits of each photon summed on the way. The
    depth of a flight is marched again: each voxel gets minus the length in it times what comes from there on.
@@ -31,7 +31,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int, UInt32
 
-from jaxlidar._jax.one_function import once, one_function
+from jaxlidar._jax.one_function import barrier, one_function
 from jaxlidar._jax.vmapped_loops import any_problem, largest_count
 from jaxlidar._vectors import Scalar, Vec
 from jaxlidar.planning.config import Scatterer
@@ -172,7 +172,7 @@ def pull_back_higher_orders(
         lanes = start_unplaced(batch.send(group))
         _, (n_chunks, group_flights) = batch.trace_orders(lanes, nothing, trace_chunk)
         n_chunks = largest_count(n_chunks)
-        # Of photons that are placed in empty voxels, nothing else counts.
+        # Nothing else counts of photons that are placed in empty voxels.
         n_chunks, n_placed = jnp.where(is_placing, 0, n_chunks), jnp.where(is_placing, n_chunks, 0)
 
         def add_chunk(n: Array, state: tuple[ExtinctionTables, Array]) -> tuple[ExtinctionTables, Array]:
@@ -260,15 +260,15 @@ def _subtract_lengths(
     medium = scene.medium
     assert medium is not None
     end, largest = minimum(ray.leave, max_length), jnp.max(targets, axis=0)
-    ray, end, largest, targets, amounts = once((ray, end, largest, targets, amounts))
+    ray, end, largest, targets, amounts = barrier((ray, end, largest, targets, amounts))
 
     def step(state: _SubtractingMarch, _):
         distance, depth, voxel, running = state
-        faces = once(ray.face_distances(voxel))
+        faces = barrier(ray.face_distances(voxel))
         to = maximum(distance, minimum(end, minimum(minimum(faces[0], faces[1]), faces[2])))
         cell = cell_index(medium, voxel)
         k = medium.extinction(cell, w)
-        to, cell, k = once((to, cell, k))
+        to, cell, k = barrier((to, cell, k))
         length = select(running, to - distance, jnp.zeros_like(to))
         lost = jnp.zeros_like(to)
         for target, amount in zip(targets, amounts):
@@ -296,7 +296,7 @@ def _subtract_lengths(
         march, _, n_steps = state
         return any_problem(march.running) & (n_steps < scene.config.max_faces)
 
-    # Of rays whose amounts are all zero, nothing would be subtracted.
+    # Nothing would be subtracted for rays whose amounts are all zero.
     running = jnp.any(amounts != 0.0, axis=0) & (ray.enter < end)
     start, zero = jnp.minimum(ray.enter, end), jnp.zeros_like(end)
     march = _SubtractingMarch(start, zero, ray.voxel, running)

@@ -19,7 +19,7 @@ from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 from jaxtyping import Array
 
-# Of lists of residuals and of arguments (cotangents) to a list of results.
+# A function of lists of residuals and of arguments (cotangents), which gives a list of results.
 FlatMap = Callable[[list[Array], list[Array]], Sequence[Array]]
 
 
@@ -102,7 +102,7 @@ def _pull_back(
 ) -> list[Any]:
     residuals, arguments = operands[:n_residuals], operands[n_residuals:]
     of_results = [ad.instantiate_zeros(c) for c in cotangents]
-    # Of arguments that the map is not transposed by, their values are at hand, of others their types.
+    # The values of arguments that the map is not transposed by are at hand, the types of the others.
     types = [a.aval if ad.is_undefined_primal(a) else a for a in arguments]
     pulled = linear_map(transpose, function, residuals, of_results, types)
     # Tangents that are known are zeros: nothing is asked of them.

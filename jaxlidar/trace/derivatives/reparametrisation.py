@@ -239,7 +239,7 @@ def rays_with_grids(
 ) -> tuple[tuple[Scalar, Scalar], Scalar]:
     """Move the rays of the footprint with the geometry, if they move at all.
 
-    1. Of a Gaussian beam, rays move with grids and terrain (`move_across_beam`). The beam itself does not
+    1. Rays of a Gaussian beam move with grids and terrain (`move_across_beam`). The beam itself does not
        move them: the ratio of its irradiance makes up for a change of its width, and for their motion.
     2. The rim of a top-hat beam would not make up for it. Rays widen with the beam, and stay within its rim.
     3. Where shapes state outlines, the motion is blended with that of these.

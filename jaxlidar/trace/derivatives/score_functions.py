@@ -14,9 +14,9 @@ Scores ("score" is the value of this function, not a contribution to a tally) ar
 themselves, one for each parameter theta_j: no derivative is pushed through the march, which would carry
 tangents of positions, directions and times along.
 
-First order is deterministic, and differentiated piece by piece. Of the return of a material with the
-extinction k_m and the intensity factor V_m from a piece of a segment of a ray of the energy E,
-V_m E k_m I with I = integral of exp(-kappa tau) ds, the derivative is
+First order is deterministic, and differentiated piece by piece. A material with the
+extinction k_m and the intensity factor V_m returns V_m E k_m I, with I = integral of exp(-kappa tau) ds,
+from a piece of a segment of a ray of the energy E. The derivative is
 
     V_m E [ k_m (dI/dk) dk  +  I (d k_m - kappa k_m d tau_0) ],
 

@@ -25,7 +25,7 @@ from jaxtyping import Array, Float, Int
 
 from jaxlidar._constants import SPEED_OF_LIGHT
 from jaxlidar._jax.mesh_axes import vary_with
-from jaxlidar._jax.one_function import once
+from jaxlidar._jax.one_function import barrier
 from jaxlidar._vectors import FAR, Scalar, Vec, add, along, scale
 from jaxlidar.optics.facets import FACET_BACKSCATTER
 from jaxlidar.optics.laws import AbstractMirror
@@ -392,7 +392,7 @@ class FirstOrderTracer:
         returned, arrived, return_slopes = tally.of_medium
         for of_material in light.returned:
             # Optimisation barriers: fused, the factor would be computed again for each piece, out of order.
-            row = once(light.pieces * once(of_material.extinction * of_material.factor)[None])
+            row = barrier(light.pieces * barrier(of_material.extinction * of_material.factor)[None])
             row = jnp.moveaxis(row, 0, -1)
             tally_row = jnp.broadcast_to(of_material.row, light.first_bin.shape)
             returned = add_rows(returned, tally_row, light.first_bin, row)

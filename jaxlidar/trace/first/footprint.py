@@ -11,8 +11,8 @@ A lidar that is placed by its sensor (`Lidar(sensor=...)`) has its aim point R =
 lengths are then those from the sensor itself: "excess" is all of |x + R a|, which single precision resolves
 to 6e-5 m at 1 km.
 
-Of a Gaussian beam with the radius w0 (at 1/e^2) the circle of radius r encloses the fraction
-1 - exp(-2 r^2 / w0^2) of the energy; of a top-hat r^2 / w0^2. Rays lie on a Fibonacci disc (Vogel's spiral):
+The circle of radius r encloses the fraction 1 - exp(-2 r^2 / w0^2) of the energy of a Gaussian beam with the
+radius w0 (at 1/e^2), and r^2 / w0^2 of that of a top-hat. Rays lie on a Fibonacci disc (Vogel's spiral):
 enclosed fractions in equal steps, so that rays carry equal energies, and directions that turn by the golden
 angle. For smooth integrands, a product rule of unequal weights is more accurate (`product_rule`).
 """
@@ -280,10 +280,10 @@ def interleaving_shifts(shift: Float[Array, "2"], count: int) -> Float[Array, "l
     """Return shifts of `count` Fibonacci discs that make up one disc of `count` times as many rays.
 
     Ray k of each, k = 0, 1, ..., becomes number count k + j of the dense disc, which turns from ray to ray by
-    the angle a with count a = golden angle, in whole turns and a fraction. Of the angles that fulfil this the
-    one is taken whose multiples stay farthest from whole turns. If `shift` is uniform in [0, 1), so is every
-    shift: each disc is an unbiased estimate on its own, and their scatter an upper bound of the variance of
-    their mean, which lacks the gaps that discs shifted independently would leave (see
+    the angle a with count a = golden angle, in whole turns and a fraction. It is the angle
+    among those that fulfil this whose multiples stay farthest from whole turns. If `shift` is uniform in
+    [0, 1), so is every shift: each disc is an unbiased estimate on its own, and their scatter an upper bound
+    of the variance of their mean, which lacks the gaps that discs shifted independently would leave (see
     `jaxlidar.survey.per_shot`).
     """
     angles = (GOLDEN + np.arange(count)) / count

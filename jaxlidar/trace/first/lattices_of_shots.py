@@ -119,12 +119,12 @@ def response_of_lattice(
         return jnp.zeros((*a.shape, histories.count), a.dtype).at[..., 0].set(a)
 
     arrivals = unscattered(arrived)
-    departed, escapes, remaining = fates_after_first_scattering(
+    departed, escapes, unfollowed = fates_after_first_scattering(
         scene, arrivals, unscattered(scattered), unscattered(escaped)
     )
     monomials = histories.monomials(optics)
     arrivals, departed = (einsum("mh,hw->wm", a, monomials)[..., None] for a in (arrivals, departed))
-    escapes, remaining = (einsum("h,hw->w", a, monomials)[:, None] for a in (escapes, remaining))
+    escapes, unfollowed = (einsum("h,hw->w", a, monomials)[:, None] for a in (escapes, unfollowed))
     return Response(
         first=(reflectance[..., None] * weights[None])[:, :, None],
         higher=None,
@@ -133,6 +133,6 @@ def response_of_lattice(
         arrived=arrivals,
         departed=departed,
         escaped=escapes,
-        late=jnp.zeros_like(remaining),
-        remaining=remaining,
+        flown_outside=jnp.zeros_like(unfollowed),
+        unfollowed=unfollowed,
     )

@@ -10,7 +10,7 @@ at s on,
 The transmittance up to s needs no factor: a flight reaches s with exactly that probability. This is the term
 of in-scattering of the differential transfer equation (Nimier-David, Mueller, Keller and Jakob 2022, ACM
 Trans. Graph. 41, 44). The integral is L times the integrand at a uniform point; a photon ends where that does
-not lie in an empty voxel. Of leaves that are not spherically oriented, k is multiplied by 2 G.
+not lie in an empty voxel. For leaves that are not spherically oriented, k is multiplied by 2 G.
 
 Photons are traced once more for this. Each is placed at one of its orders n = 1, 2, ...: with the probability
 P = 1 / (n + 1) if it was not before, and P = 1 at the last one. Its weight is divided by P, or by 1 - P if it
@@ -170,7 +170,7 @@ class EmptyVoxels(NamedTuple):
             flights,
             collided=jnp.where(is_placed_now, length * k > 0.0, flights.collided),
             landed=flights.landed & ~is_placed_now,
-            late=flights.late & ~is_placed_now,
+            outside=flights.outside & ~is_placed_now,
             escaped=flights.escaped & ~is_placed_now,
             cell=jnp.where(is_placed_now, cell, flights.cell),
             distance=jnp.where(is_placed_now, distance, flights.distance),

@@ -36,7 +36,7 @@ from jaxlidar.trace.photons.photons import GAP, STOPPED, TRANSMITTED, Photons, a
 class Flight(eqx.Module):
     """The ends of flights: in the medium, on a surface, after the record, or never.
 
-    - `collided`, `landed`, `late`, `escaped`: which of these, all False for photons that are not alive.
+    - `collided`, `landed`, `outside`, `escaped`: which of these, all False for photons that are not alive.
     - `cell`: the voxel of a collision.
     - `distance`: length flown, m.
     - `ratio`: attached ratio of the density of that distance but for the factor k (see the module), or of
@@ -51,7 +51,7 @@ class Flight(eqx.Module):
 
     collided: Bool[Array, "*photons"]
     landed: Bool[Array, "*photons"]
-    late: Bool[Array, "*photons"]
+    outside: Bool[Array, "*photons"]
     escaped: Bool[Array, "*photons"]
     cell: Int[Array, "*photons"]
     distance: Float[Array, "*photons"]
@@ -216,6 +216,6 @@ def sample_flights(
     collided = alive & collided
     hits_nothing = alive & ~collided & ~landed
     # Beyond `max_length` there is a surface, or still medium: its light comes after the record.
-    late = hits_nothing & (to_ends(nearest_stop < FAR) | stopped_in_medium)
-    escaped = hits_nothing & ~late
-    return Flight(collided, landed, late, escaped, cell, distance, ratio, depth_slopes, path_slopes)
+    outside = hits_nothing & (to_ends(nearest_stop < FAR) | stopped_in_medium)
+    escaped = hits_nothing & ~outside
+    return Flight(collided, landed, outside, escaped, cell, distance, ratio, depth_slopes, path_slopes)

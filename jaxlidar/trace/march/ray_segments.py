@@ -23,7 +23,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxlidar._constants import SPEED_OF_LIGHT
 from jaxlidar._jax.mesh_axes import vary_together
-from jaxlidar._jax.one_function import once
+from jaxlidar._jax.one_function import barrier
 from jaxlidar._jax.vmapped_loops import largest_count
 from jaxlidar._vectors import Scalar, Vec
 from jaxlidar.planning.config import TimeBins
@@ -98,7 +98,7 @@ def march_ray(
 
     def step(state, _):
         distance, depth, voxel, depth_at_stops = state
-        faces = once(ray.face_distances(voxel))
+        faces = barrier(ray.face_distances(voxel))
         face = minimum(minimum(faces[0], faces[1]), faces[2])
         to = minimum(end, minimum(face, distance + max_length))
         for stop in stops:
@@ -106,7 +106,7 @@ def march_ray(
             to = jnp.where(stop > distance, minimum(to, stop), to)
         cell = cell_index(medium, voxel)
         k = medium.extinction(cell, w)
-        to, cell, k = once((maximum(distance, to), cell, k))
+        to, cell, k = barrier((maximum(distance, to), cell, k))
         length = to - distance
         depth_at_stops = [
             d + k * (maximum(distance, minimum(stop, to)) - distance)
@@ -157,9 +157,9 @@ def integrate_over_bins(
         return mean_decay(kappa * segments.extinction * length) * length
 
     # Optimisation barrier: these would be computed again for each bin.
-    first, whole, last = once(tuple(integral_over(length) for length in lengths))
+    first, whole, last = barrier(tuple(integral_over(length) for length in lengths))
     first_depth = kappa * segments.extinction * (first_length * bin_length)
-    depth, depth_of_whole = once((kappa * segments.depth, kappa * segments.extinction * bin_length))
+    depth, depth_of_whole = barrier((kappa * segments.depth, kappa * segments.extinction * bin_length))
 
     def piece(n_before: Array, transmittance: Scalar) -> Scalar:
         integral = jnp.where(n_before < n_whole, whole, jnp.where(n_before > n_whole, 0.0, last))
@@ -185,7 +185,7 @@ def _transmittances_at_steps(
     powers = [jnp.exp(-step)]
     while 2 ** len(powers) < count:
         powers.append(powers[-1] * powers[-1])
-    transmittance, powers = once((jnp.exp(-depth), powers))
+    transmittance, powers = barrier((jnp.exp(-depth), powers))
 
     def after_steps(number: Int[Array, ""]) -> Scalar:
         product = transmittance

@@ -23,7 +23,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxlidar._jax.mesh_axes import vary_together
-from jaxlidar._jax.one_function import once, one_function
+from jaxlidar._jax.one_function import barrier, one_function
 from jaxlidar._jax.vmapped_loops import any_problem
 from jaxlidar._vectors import FAR, Scalar, Vec, dot, vec
 from jaxlidar.optics.leaf_angles import ANGLE_NODES, LeafAngles
@@ -413,9 +413,9 @@ def march_to_depths(
     ray = enter_grid(medium, x, w, box)
     end = minimum(ray.leave, max_length)
     largest = jnp.max(targets, axis=0) if len(targets) else jnp.full_like(max_length, jnp.inf)
-    # Optimisation barriers (`once`) here and in the step: values that several results share would otherwise
+    # Optimisation barriers here and in the step: values that several results share would otherwise
     # be computed again for each result.
-    ray, end, targets, largest = once((ray, end, targets, largest))
+    ray, end, targets, largest = barrier((ray, end, targets, largest))
 
     def for_targets(a: Array) -> Array:
         return jnp.broadcast_to(a, targets.shape)
@@ -433,18 +433,18 @@ def march_to_depths(
     def step(state: _March, _):
         """March all rays by one step, 1 to 4 of `march_to_depths`."""
         distance, depth, voxel, running, crossings, depth_slopes, path_slopes = state
-        faces = once(ray.face_distances(voxel))
+        faces = barrier(ray.face_distances(voxel))
         # Not before `distance`: a ray that starts on a face would step back by rounding.
         to = maximum(distance, minimum(end, minimum(minimum(faces[0], faces[1]), faces[2])))
         cell = cell_index(medium, voxel)
         k = medium.extinction(cell, w)
-        to, cell = once((to, cell))
-        next_depth = once(depth + k * (to - distance))
+        to, cell = barrier((to, cell))
+        next_depth = barrier(depth + k * (to - distance))
         # Half-open, so that each target is crossed once; an empty voxel (equal depths) is never crossed.
         crossed = for_targets(running) & (for_targets(depth) <= targets) & (targets < for_targets(next_depth))
         # Photons whose last target is passed stop here: most flights are shorter than the map.
         goes_on = running & (next_depth <= largest) & (to < end)
-        crossed, goes_on = once((crossed, goes_on))
+        crossed, goes_on = barrier((crossed, goes_on))
         crossings = tuple(
             select(crossed, for_targets(new), old) for new, old in zip((distance, to, depth, cell), crossings)
         )

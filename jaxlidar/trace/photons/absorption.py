@@ -99,7 +99,7 @@ def trace_to_end(
 
     - `optics`: reflectance or transmittance of every channel.
     - `count`: number of photons.
-    - `source`: returns starts and directions of so many photons, as `from_beam` does.
+    - `source`: returns starts and directions of `count` photons, as `from_beam` does.
     """
     start_key, key = jax.random.split(key)
     x, w = source(scene, start_key, count)
@@ -121,9 +121,9 @@ def trace_to_end(
         return _trace_order(scene, optics, loop, jax.random.fold_in(key, loop.order))
 
     end = jax.lax.while_loop(continue_, step, start)
-    # Not lost silently: what the last order leaves is reported as unfollowed.
-    remaining = jnp.sum(jnp.where(end.photons.alive[:, None], end.energy, 0.0), axis=0)
-    unfollowed = end.fractions.unfollowed + remaining
+    # What the last order leaves is not followed, and is reported so.
+    after_last = jnp.sum(jnp.where(end.photons.alive[:, None], end.energy, 0.0), axis=0)
+    unfollowed = end.fractions.unfollowed + after_last
     fractions = eqx.tree_at(lambda f: f.unfollowed, end.fractions, unfollowed)
     return jax.tree.map(lambda a: a / count, fractions)
 
@@ -172,7 +172,7 @@ def _trace_order(scene: DeviceScene, optics: Array, loop: _PhotonLoop, key: PRNG
 
     escaped = jnp.where(flight.escaped[:, None], energy, 0.0)
     upward = (p.w[2] > 0)[:, None]
-    late = jnp.where(flight.late[:, None], energy, 0.0)
+    outside = jnp.where(flight.outside[:, None], energy, 0.0)
     x, path, collision = collide(scene, p, flight, encounters, draws)
     energy = jnp.where(flight.has_hit[:, None], energy, 0.0)
     for scatterer in (config.leaf, config.bark):
@@ -212,7 +212,7 @@ def _trace_order(scene: DeviceScene, optics: Array, loop: _PhotonLoop, key: PRNG
         up=fractions.up + jnp.sum(jnp.where(upward, escaped, 0.0), axis=0),
         down=fractions.down + jnp.sum(jnp.where(upward, 0.0, escaped), axis=0),
         on_ground=on_ground,
-        unfollowed=fractions.unfollowed + jnp.sum(late, axis=0),
+        unfollowed=fractions.unfollowed + jnp.sum(outside, axis=0),
     )
     return _PhotonLoop(photons, energy, fractions, loop.order + 1)
 

@@ -14,7 +14,7 @@ transmittance, as apparent reflectance, it is the intensity factor
 
     V = pi x BRDF x cos(view)  of a surface,   V = pi x p(w -> v)  of a volume with the phase function p,
 
-times the transmittance of the return path. Of a surface that is the bidirectional reflectance factor (BRF)
+times the transmittance of the return path. For a surface that is the bidirectional reflectance factor (BRF)
 times the cosine of the view angle, per unit reflectance; p integrates to one over solid angle (1/sr).
 
 The attached ratios of the densities by which facets and directions were drawn keep derivatives unbiased
@@ -25,8 +25,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int
 
-from jaxlidar._jax.one_function import once
-from jaxlidar._vectors import Scalar, Vec, about, along, dot, polar, scale, vec
+from jaxlidar._jax.one_function import barrier
+from jaxlidar._vectors import Scalar, Vec, along, cosine_direction, dot, polar, scale, vec
 from jaxlidar.optics.facets import facet_normal, facet_reflection, facet_transmission
 from jaxlidar.optics.phase import AbstractPhase
 from jaxlidar.planning.config import Scatterer
@@ -69,7 +69,7 @@ def sample_collision(
     """
     one = jnp.ones_like(w[0])
     minus_one = jnp.full(one.shape, -1, jnp.int32)
-    # Of photons that hit nothing, whose weight is zero.
+    # For photons that hit nothing, whose weight is zero.
     collision = Collision(
         material=jnp.zeros_like(minus_one),
         channel=minus_one,
@@ -129,7 +129,7 @@ def _on_surface(
         through = draws.choice >= q
         # Diffuse transmission is a Lambertian surface seen from behind.
         below = scale(detached_normal, jnp.asarray(-1.0))
-        transmitted = about(below, *draws.direction)
+        transmitted = cosine_direction(below, *draws.direction)
         out, exit_normal = _select(through, transmitted, out), _select(through, below, exit_normal)
         law_number = jnp.where(through, COSINE_LAW, law_number)
         # The cosine is the density up to a constant, which an attached ratio does not see.
@@ -184,8 +184,8 @@ def _on_leaf(
     2. The facet's normal: of spherically oriented facets drawn with its own density, so that its weight is
        one; of others from g(n), with the weight |n.w| / G.
     3. The direction onward: the cosine law about the lit side.
-    4. Of a leaf that transmits, with the probability 1 - q mirrored into the other side; onward weights are
-       divided by q or 1 - q.
+    4. Where a leaf transmits, the direction is mirrored into the other side with the probability 1 - q;
+       onward weights are divided by q or 1 - q.
     """
     if medium.leaf_phase is not None:
         return _by_phase(medium.leaf_phase, scene.leaf_law, leaf, w, k, draws)
@@ -200,7 +200,7 @@ def _on_leaf(
         normal, normal_weight = _leaf_normal(medium, w, *draws.normal)
         weight = weight * normal_weight
     # Cosine law about the facet's lit side.
-    out, exit_normal = about(normal, *draws.direction), normal
+    out, exit_normal = cosine_direction(normal, *draws.direction), normal
     if leaf.transmission >= 0:
         through = choice >= q
         exit_normal = _select(through, scale(normal, jnp.asarray(-1.0)), normal)
@@ -219,7 +219,7 @@ def _on_bark(
         return _by_phase(medium.bark_phase, scene.bark_law, bark, w, k, draws)
     channel = jnp.full(k.shape, bark.reflection, jnp.int32)
     normal = jax.tree.map(detach, facet_normal(w, *draws.normal))
-    out, onward_weight = about(normal, *draws.direction), _attached_facet_ratio(w, normal)
+    out, onward_weight = cosine_direction(normal, *draws.direction), _attached_facet_ratio(w, normal)
     return _voxel_collision(
         bark, channel, attached_ratio(k), onward_weight, COSINE_LAW, w, out, normal, normal
     )
@@ -330,7 +330,7 @@ def intensity_factors(
         cos_scattering = dot(w, v)
         # The means over the normals of spherically oriented facets, so that the sampled normal does not
         # matter; behind an optimisation barrier, as they serve several results.
-        front, back = once((facet_reflection(cos_scattering), facet_transmission(cos_scattering)))
+        front, back = barrier((facet_reflection(cos_scattering), facet_transmission(cos_scattering)))
         in_voxel = collision.surface < 0
         if config.leaf is not None:
             transmits.append(config.leaf.transmission >= 0)

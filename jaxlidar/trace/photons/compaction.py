@@ -11,14 +11,14 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Int
 
-from jaxlidar._jax.one_function import once
+from jaxlidar._jax.one_function import barrier
 from jaxlidar.trace.device_scene import DeviceScene
 from jaxlidar.trace.march.voxel_traversal import enter_grid
 from jaxlidar.trace.photons.photons import Photons
 
 # Classes: rays that miss the box of occupied voxels, cross at most about `SHORT_PATH` faces in it, and more.
 N_CLASSES, SHORT_PATH = 3, 32
-# Counts of all classes are packed into one integer, of so many bits each: a chunk has fewer than 1,024
+# Counts of all classes are packed into one integer, of this many bits each: a chunk has fewer than 1,024
 # photons.
 _COUNT_BITS = 10
 
@@ -34,9 +34,9 @@ def compact(scene: DeviceScene, photons: Photons) -> tuple[Int[Array, "chunks si
     """
     alive = photons.alive
     # Optimisation barriers: these arrays would otherwise be computed again for each use.
-    path_class = once(jnp.where(alive, _path_classes(scene, photons), N_CLASSES))
+    path_class = barrier(jnp.where(alive, _path_classes(scene, photons), N_CLASSES))
     class_bit = jnp.where(alive, 1 << (_COUNT_BITS * path_class), 0)
-    running = once(jnp.cumsum(class_bit, axis=1))
+    running = barrier(jnp.cumsum(class_bit, axis=1))
 
     def count_of(packed: Int[Array, "*s"], number: int) -> Int[Array, "*s"]:
         return (packed >> (_COUNT_BITS * number)) & ((1 << _COUNT_BITS) - 1)
@@ -46,7 +46,7 @@ def compact(scene: DeviceScene, photons: Photons) -> tuple[Int[Array, "chunks si
     position = jnp.full(alive.shape, alive.size)
     for c in range(N_CLASSES):
         position = jnp.where(path_class == c, before[c][:, None] + count_of(running, c) - 1, position)
-    number, position = jnp.arange(alive.size), once(position.reshape(-1))
+    number, position = jnp.arange(alive.size), barrier(position.reshape(-1))
     source = jnp.zeros_like(number).at[position].set(number, mode="drop")
     return source.reshape(alive.shape), jnp.sum(per_chunk)
 

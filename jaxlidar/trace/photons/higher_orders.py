@@ -43,7 +43,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, UInt32
 
 from jaxlidar._constants import SPEED_OF_LIGHT
 from jaxlidar._jax.mesh_axes import vary_with
-from jaxlidar._jax.one_function import once
+from jaxlidar._jax.one_function import barrier
 from jaxlidar._jax.vmapped_loops import any_problem, largest_count
 from jaxlidar._vectors import FAR, Scalar, Vec, along
 from jaxlidar.trace.deposit import add_rows, bspline_row
@@ -103,8 +103,8 @@ class HigherOrderTally(eqx.Module):
     - `weights`, `outside`: returns within the bins and outside of them; with both margins while photons are
       traced.
     - `arrived`, `departed`: weight that reached each material, and that went on from it.
-    - `escaped`, `late`, `remaining`: weight that left the scene, that could not be recorded any more, and
-      that was still in flight after the last order.
+    - `escaped`, `flown_outside`, `unfollowed`: weight that left the scene, that could not be recorded any
+      more, and that was still in flight after the last order.
     - `weight_slopes`: derivatives of the returns with respect to parameters; None without score functions.
     """
 
@@ -113,8 +113,8 @@ class HigherOrderTally(eqx.Module):
     arrived: Float[Array, "materials entries"]
     departed: Float[Array, "materials entries"]
     escaped: Float[Array, "entries"]
-    late: Float[Array, "entries"]
-    remaining: Float[Array, "entries"]
+    flown_outside: Float[Array, "entries"]
+    unfollowed: Float[Array, "entries"]
     weight_slopes: Float[Array, "bins parameters wavelengths"] | None = None
 
     def with_arrival(self, material: Array | int, index: TallyIndex, weight: Scalar) -> "HigherOrderTally":
@@ -222,7 +222,7 @@ class PhotonBatch:
                 number = source[chunk]
                 in_chunk = jax.tree.map(lambda a: a.at[number].get(mode="promise_in_bounds"), flat)
                 alive = chunk * chunk_size + jnp.arange(chunk_size) < n_living
-                return once(eqx.tree_at(lambda c: c.photons.alive, in_chunk, alive))
+                return barrier(eqx.tree_at(lambda c: c.photons.alive, in_chunk, alive))
 
             def trace(in_chunk, sums):
                 draws = PhotonDraws.from_numbers(self.lattices(in_chunk.lane, order), scene.n_plates)
@@ -302,8 +302,8 @@ def trace_photons(
         lanes, tally = batch.trace_orders(batch.send(group), empty, trace_chunk)
         p = lanes.photons
         weight = jnp.where(p.alive, p.weight, 0.0)
-        remaining = add_to_tally(tally.remaining, (), TallyIndex.of(p), weight)
-        tally = eqx.tree_at(lambda t: t.remaining, tally, remaining)
+        unfollowed = add_to_tally(tally.unfollowed, (), TallyIndex.of(p), weight)
+        tally = eqx.tree_at(lambda t: t.unfollowed, tally, unfollowed)
         return jax.tree.map(jnp.add, total, _without_margins(scene, tally)), None
 
     # Likewise with groups, whose photons are kept for each order.
@@ -343,8 +343,8 @@ def empty_tally(scene: DeviceScene, nodes: EntryNodes | None = None) -> HigherOr
         arrived=jnp.zeros((n_materials, n_entries)),
         departed=jnp.zeros((n_materials, n_entries)),
         escaped=jnp.zeros((n_entries,)),
-        late=jnp.zeros((n_entries,)),
-        remaining=jnp.zeros((n_entries,)),
+        flown_outside=jnp.zeros((n_entries,)),
+        unfollowed=jnp.zeros((n_entries,)),
         weight_slopes=None
         if slopes is None
         else jnp.zeros((bins.padded, slopes.count, slopes.history_optics.shape[1])),
@@ -463,7 +463,7 @@ def fly(
         flights = move_landings(scene, p, encounters, flights, order > 0)
     # Optimisation barrier: flights serve several results, each of which would compute the march again.
     stops = (encounters.stops, encounters.nearest_stop, encounters.mesh_normal)
-    p, draws, flights, stops = once((p, draws, flights, stops))
+    p, draws, flights, stops = barrier((p, draws, flights, stops))
     stops, nearest_stop, mesh_normal = stops
     encounters = dataclasses.replace(
         encounters, stops=stops, nearest_stop=nearest_stop, mesh_normal=mesh_normal
@@ -499,8 +499,8 @@ def scatter(
     # no weight.
     flight, weight, index = jax.tree.map(flown.select_end, (flown.flights, flown.weight, flown.index))
     escaped = add_to_tally(tally.escaped, (), index, jnp.where(flight.escaped, weight, 0.0))
-    late = add_to_tally(tally.late, (), index, jnp.where(flight.late, weight, 0.0))
-    tally = eqx.tree_at(lambda t: (t.escaped, t.late), tally, (escaped, late))
+    flown_outside = add_to_tally(tally.flown_outside, (), index, jnp.where(flight.outside, weight, 0.0))
+    tally = eqx.tree_at(lambda t: (t.escaped, t.flown_outside), tally, (escaped, flown_outside))
 
     # The collision is sampled again for the selected end: taking it from the deposits would keep the onward
     # directions of all ends alive.
@@ -669,7 +669,7 @@ def returns_of_ends(
     value = jnp.where(ends.flights.has_hit, weight, 0.0) * ends.collision.weight / n_ends
     # Optimisation barrier: of the collision only what its return depends on passes, so that directions onward
     # are not computed.
-    w, x, path, value, index, collision, plate_draws, score = once(
+    w, x, path, value, index, collision, plate_draws, score = barrier(
         (
             ends.p.w,
             ends.x,
@@ -743,16 +743,16 @@ def _returns_of_collisions(
     if scene.shot_views is not None:
         assert index.entry_point is not None
         # One row for each shot that may see the path.
-        shots, seen, delay = once(scene.shot_views.seen_by_shots(beam.axis, index.entry_point, x))
+        shots, seen, delay = barrier(scene.shot_views.seen_by_shots(beam.axis, index.entry_point, x))
         time, value, material = time[:, None] + delay, value[:, None] * seen, material[:, None]
     # One row serves all channels and wavelengths, which differ by factors alone.
-    first_bin, row = once(bspline_row(bins, time, value))
+    first_bin, row = barrier(bspline_row(bins, time, value))
     rows = []
     for channel, factor in channel_factors:
         factor = jnp.where(channel >= 0, factor, 0.0)
         for tally_row, optical_weight in index.after(scene, channel).rows(shots):
             # Optimisation barrier: fused into the rows, the factor would be computed again for each bin.
-            scaled = once(factor if optical_weight is None else factor * optical_weight)
+            scaled = barrier(factor if optical_weight is None else factor * optical_weight)
             scaled = scaled.reshape(scaled.shape + (1,) * (row.ndim - 1))
             rows.append((material * n_entries + tally_row, row * scaled))
     return BinnedReturns(first_bin, rows, row, channel_factors, index, score)
@@ -817,8 +817,8 @@ def _return_through_surfaces(
        light of shared illumination at nadir, nothing is hidden.
     2. A plate that is crossed is sampled, gap or material, so that each photon has one history; the factor is
        the attached ratio of that outcome.
-    3. Material of a plate that transmits straight on adds its channel to the history; of another it lets
-       nothing through.
+    3. Material of a plate that transmits straight on adds its channel to the history; that of
+       another plate lets nothing through.
     """
     draws, to_sensor = iter(plate_draws), scene.beam.distance_to_sensor(x)
     # What lies behind the sensor is not crossed.

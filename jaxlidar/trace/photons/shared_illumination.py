@@ -81,8 +81,8 @@ def trace_nodes(scene: DeviceScene, nodes: EntryNodes, key: PRNGKeyArray) -> Res
         arrived=by_node(higher.arrived)[..., None],
         departed=by_node(higher.departed)[..., None],
         escaped=by_node(higher.escaped)[..., None],
-        late=by_node(higher.late)[..., None],
-        remaining=by_node(higher.remaining)[..., None],
+        flown_outside=by_node(higher.flown_outside)[..., None],
+        unfollowed=by_node(higher.unfollowed)[..., None],
     )
 
 
@@ -135,8 +135,8 @@ def trace_shots(scene: DeviceScene, lidar: Lidar, nodes: EntryNodes, key: PRNGKe
         arrived=from_nodes(higher.arrived),
         departed=from_nodes(higher.departed),
         escaped=from_nodes(higher.escaped),
-        late=from_nodes(higher.late),
-        remaining=from_nodes(higher.remaining),
+        flown_outside=from_nodes(higher.flown_outside),
+        unfollowed=from_nodes(higher.unfollowed),
     )
     # The last is the dummy shot.
     return jax.tree.map(lambda a: a[:-1], response)

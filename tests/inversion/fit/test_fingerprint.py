@@ -226,7 +226,7 @@ def test_changes_that_affect_no_result_are_accepted(resumes):
     assert resumes()
     assert resumes(lanes=1)
     assert resumes(progress=print)
-    assert resumes(noise=np.full((2, 2, TIME.size), 0.1), time=TIME.tolist(), starts=1.0)
+    assert resumes(noise=np.full((2, 2, TIME.size), 0.1), time=TIME.tolist(), starts=1)
     assert resumes(start={"height": np.zeros(2)})
     assert resumes(unknowns=unknowns(height={"where": lambda s: s.ground.height}))
     assert resumes(**lidar(receiver=jl.Receiver(window="first return")))

@@ -463,8 +463,6 @@ LOW_PLAN = jl.plan(PLAIN, ground_scene(), window=(-20.0, 20.0), describe=False)
         (retrieval_with(noise=0.0, noise_floor=0.0), "admissible is a noise above 0"),
         (retrieval_with(noise_floor=-1.0), "noise_floor = -1"),
         (retrieval_with(max_steps=0), "max_steps = 0"),
-        (retrieval_with(starts=1.5), "starts = 1.5 is outside"),
-        (retrieval_with(max_steps=np.nan), "max_steps = nan is outside"),
         (retrieval_with(n_photons=4), r"n_photons = 4 is outside the admissible range \[8, inf\)"),
         (
             retrieval_with(plan=jl.plan(PLAIN, jl.Scene(ground=jl.Ground())), n_rays=64),

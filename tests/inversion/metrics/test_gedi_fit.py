@@ -1,5 +1,7 @@
 """Fits of GEDI shots: preparation, columns, damaged shots, and numbers of recorded shots."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -226,3 +228,33 @@ def test_fits_of_recorded_shots_keep_their_numbers(shared, tmp_path):
         assert stored["fit_ground"].attrs == {"units": "m", "long_name": "fit: elevation of the ground"}
         assert stored["fit_plant_area_density"].dims == ("shot", "fit_layer")
         assert stored["fit_layer"].values.tolist() == list(range(1, LAYERS + 1))
+
+
+def damaged(record):
+    """Yield kinds of damage and the changed fields of a shot."""
+    waveform, mean, number = record.waveform, record.noise_mean, np.arange(record.waveform.size)
+    peak, signal = int(np.argmax(waveform)), record.signal
+    end = slice(0, peak + 6)
+    yield "clipped", {"waveform": np.minimum(waveform, mean + 0.4 * signal[peak])}
+    yield "cut", {name: getattr(record, name)[end] for name in ("waveform", "time", "elevation")}
+    yield "padded", {"waveform": np.where(number > peak + 5, mean, waveform)}
+    quiet = np.random.default_rng(0).normal(size=waveform.size)
+    yield "noise", {"waveform": mean + 0.5 * record.noise_std * quiet}
+    yield "dead", {"waveform": np.where(number == peak - 6, mean, waveform)}
+    yield "gain", {"waveform": mean + signal * np.where(number >= peak, 2.0, 1.0)}
+
+
+@pytest.mark.slow
+def test_damaged_shots_are_not_good(shared):
+    """Two good shots, and six damaged copies of each."""
+    path = shared / RECORD
+    if not path.is_file():
+        pytest.skip("the recorded GEDI file is not beside this checkout")
+    intact = read_gedi_l1b(path, SHOTS)
+    copies = [
+        (name, dataclasses.replace(record, **change)) for record in intact for name, change in damaged(record)
+    ]
+    table = inversion.gedi_table([*intact, *(record for _, record in copies)], fit=True)
+    quality = table["fit_quality"].tolist()
+    assert quality[:2] == ["good", "good"]
+    assert [name for (name, _), q in zip(copies, quality[2:]) if q == "good"] == []
