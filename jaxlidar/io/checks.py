@@ -67,6 +67,18 @@ def refuse_damage(refusal: str) -> Iterator[None]:
         raise ValueError(f"{refusal} ({error})") from error
 
 
+@contextlib.contextmanager
+def required_for(purpose: str, extra: str = "io") -> Iterator[None]:
+    """Within the context, import packages of an extra.
+
+    **Raises:** ImportError that names the purpose, the package that is missing, and how to install it.
+    """
+    try:
+        yield
+    except ImportError as error:
+        raise ImportError(f'{purpose} needs {error.name}: pip install "jaxlidar[{extra}]"') from error
+
+
 def existing_file(path: str | os.PathLike[str]) -> Path:
     """Return the path of a file that exists. **Raises:** FileNotFoundError."""
     path = Path(path)

@@ -27,7 +27,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from jaxlidar._fields.checks import check_kind, warn_user
-from jaxlidar.io.checks import TWO_WAY_METRES_PER_NS, TWO_WAY_TOLERANCE
+from jaxlidar.io.checks import TWO_WAY_METRES_PER_NS, TWO_WAY_TOLERANCE, required_for
 
 # Numbers of the variable length records of LAS and PulseWaves files that declare the system: GeoTIFF keys
 # with their floating-point numbers and texts, WKT, and a transformation of coordinates as WKT.
@@ -177,25 +177,20 @@ class CoordinateSystem:
         return system_of_name("crs", json.dumps(definition))
 
 
-def import_rasterio(purpose: str) -> Any:
-    """Return the package rasterio. **Raises:** ImportError that names the purpose."""
-    try:
-        import rasterio
-        import rasterio.errors
-    except ImportError as error:
-        raise ImportError(f'{purpose} need the package rasterio: pip install "jaxlidar[io]"') from error
-    return rasterio
-
-
 def import_pyproj(purpose: str) -> Any:
     """Return the package pyproj. **Raises:** ImportError that names the purpose."""
-    try:
+    with required_for(purpose):
         import pyproj
-        import pyproj.exceptions
         import pyproj.transformer
-    except ImportError as error:
-        raise ImportError(f'{purpose} need the package pyproj: pip install "jaxlidar[io]"') from error
     return pyproj
+
+
+def import_rasterio(purpose: str) -> Any:
+    """Return the package rasterio. **Raises:** ImportError that names the purpose."""
+    with required_for(purpose):
+        import rasterio
+        import rasterio.errors
+    return rasterio
 
 
 def system_of_crs(location: str, crs: Any) -> CoordinateSystem:
@@ -206,7 +201,7 @@ def system_of_crs(location: str, crs: Any) -> CoordinateSystem:
     """
     if not crs:
         return CoordinateSystem()
-    pyproj = import_pyproj("coordinate reference systems")
+    pyproj = import_pyproj("reading coordinate reference systems")
     if not isinstance(crs, pyproj.CRS):
         # Those of rasterio.
         crs = pyproj.CRS.from_wkt(crs.to_wkt(version="WKT2_2019"))
@@ -254,7 +249,7 @@ def system_of_name(field: str, name: str) -> CoordinateSystem:
     **Raises:** TypeError where it is no string; ValueError for a name that PROJ does not know.
     """
     check_kind(field, name, str, "the name of a coordinate reference system, or None")
-    pyproj = import_pyproj("coordinate reference systems")
+    pyproj = import_pyproj("reading coordinate reference systems")
     try:
         crs = pyproj.CRS.from_user_input(name)
     except pyproj.exceptions.CRSError as error:
@@ -285,7 +280,7 @@ def transform(
     transformation, where that is coarser than 0.1 m or unknown, and with the file of a better one that is not
     installed. Conversions within one datum, as from longitude and latitude to UTM, are exact.
     """
-    pyproj = import_pyproj("transformations of coordinates")
+    pyproj = import_pyproj("transforming coordinates")
     source, target = pyproj.CRS.from_user_input(source), pyproj.CRS.from_user_input(target)
     with warnings.catch_warnings():
         # That the best one is not installed is said below, with what its lack costs.
@@ -321,7 +316,8 @@ def directions_of_north(
     crs: Any, x: Float[np.ndarray, " n"], y: Float[np.ndarray, " n"]
 ) -> Float[np.ndarray, " n"]:
     """Return the direction of a map's north at places on it, in degrees clockwise from true north."""
-    projection = import_pyproj("headings from true north").Proj(crs)
+    pyproj = import_pyproj("turning headings from true north")
+    projection = pyproj.Proj(crs)
     longitude, latitude = projection(x, y, inverse=True)
     return np.asarray(projection.get_factors(longitude, latitude).meridian_convergence)
 
@@ -371,7 +367,7 @@ def open_raster(path: Path, driver: str) -> Iterator[Any]:
 
     **Raises:** ImportError without rasterio; ValueError, naming the file, where it is damaged.
     """
-    rasterio = import_rasterio("raster files")
+    rasterio = import_rasterio("reading raster files")
     try:
         with warnings.catch_warnings(), rasterio.Env(GTIFF_REPORT_COMPD_CS="YES"):
             # A file without a position is refused by its reader.
@@ -439,7 +435,7 @@ def _combine(location: str, a: CoordinateSystem, b: CoordinateSystem) -> Coordin
 
 
 def _system_of_wkt(location: str, text: str) -> CoordinateSystem:
-    pyproj = import_pyproj("files that declare a coordinate reference system")
+    pyproj = import_pyproj("reading coordinate reference systems")
     try:
         crs = pyproj.CRS.from_wkt(text)
     except pyproj.exceptions.CRSError as error:
@@ -480,7 +476,7 @@ def _crs_of_keys(location: str, keys: dict[int, tuple[int, ...]], numbers: bytes
 
     GDAL reads keys from TIFF files only: they are put into one, of one pixel, in memory.
     """
-    rasterio = import_rasterio("files that declare a coordinate reference system")
+    rasterio = import_rasterio("reading GeoTIFF keys")
     rows = [_KEY.pack(1, 1, 1, len(keys)), *(_KEY.pack(*keys[key]) for key in sorted(keys))]
     # With GTIFF_REPORT_COMPD_CS, vertical systems are not left out.
     environment = rasterio.Env(GTIFF_REPORT_COMPD_CS="YES", GTIFF_POINT_GEO_IGNORE="YES")

@@ -32,7 +32,7 @@ from jaxlidar._fields.checks import (
     concrete_number,
 )
 from jaxlidar._fingerprint import version_of
-from jaxlidar.io.checks import MAX_COUNTS
+from jaxlidar.io.checks import MAX_COUNTS, required_for
 from jaxlidar.io.coordinates import GEOGRAPHIC, directions_of_north, metric_system, transform
 from jaxlidar.io.files import atomic_write
 from jaxlidar.sensors.lidar import Lidar
@@ -161,10 +161,8 @@ def write_gedi_l1b(
     >>> print(shot.beam, f"{shot.latitude:.2f}, {np.average(shot.elevation, weights=shot.signal):.2f} m")
     BEAM0101 50.08, 305.00 m
     """
-    try:
+    with required_for("writing GEDI files"):
         import h5py
-    except ImportError as error:
-        raise ImportError("GEDI files need h5py: pip install 'jaxlidar[io]'") from error
     check_kind("survey", survey, Survey, "a Survey, such as Survey.of(lidar)")
     margin = check_integer("margin", margin, 0)
     first_time, bins = _spans(waveforms, survey, margin)

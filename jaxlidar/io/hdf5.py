@@ -27,7 +27,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from jaxlidar.io.checks import check_unpacked_size, existing_file, refuse_damage
+from jaxlidar.io.checks import check_unpacked_size, existing_file, refuse_damage, required_for
 from jaxlidar.io.coordinates import unit_angle, unit_length, unit_time, units_agree
 
 # Attributes of numbers that are stored as counts.
@@ -59,10 +59,8 @@ def open_hdf5(path: str | os.PathLike[str]) -> Iterator["ProductFile"]:
     **Raises:** FileNotFoundError where there is no such file, ImportError without h5py, ValueError for a file
     that is not HDF5.
     """
-    try:
+    with required_for("reading HDF5"):
         import h5py
-    except ImportError as error:
-        raise ImportError('reading HDF5 needs h5py: pip install "jaxlidar[io]"') from error
     path = existing_file(path)
     with contextlib.ExitStack() as stack:
         with refuse_damage(f"{path}: not a readable HDF5 file"):

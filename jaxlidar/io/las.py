@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import ArrayLike, Num
 
 from jaxlidar._fields.checks import as_numpy, check_number, check_range, check_shape
-from jaxlidar.io.checks import MAX_COORDINATE, existing_file
+from jaxlidar.io.checks import MAX_COORDINATE, existing_file, required_for
 from jaxlidar.io.coordinates import WKT_RECORD, CoordinateSystem, check_elevations, metric_system
 from jaxlidar.io.files import atomic_write
 from jaxlidar.io.las_header import PROJECTION_USER, LasHeader, read_header
@@ -25,8 +25,6 @@ _NOISE_CLASSES = (7, 18)
 _MM, _DEGREES = (1e-3, 1e-3, 1e-3), (1e-8, 1e-8, 1e-3)
 # The first point format of LAS 1.4, whose fields hold larger numbers.
 _FORMAT_6 = 6
-# From that format on, scan angles are counted in steps of this size, degrees.
-_SCAN_ANGLE_STEP = 0.006
 # Largest numbers by field: in point formats up to 5, and from 6 on.
 _MAX_NUMBERS = {
     "return_number": (7, 15),
@@ -100,7 +98,7 @@ def read_stored_points(
 
     **Raises:** as `read_las`.
     """
-    laspy = import_laspy("reading")
+    laspy = import_laspy("reading LAS")
     with path.open("rb") as file:
         header = read_header(path, file)
         try:
@@ -134,18 +132,11 @@ def read_stored_points(
         np.asarray(cloud["number_of_returns"]).astype(int)[selected],
         np.asarray(cloud["intensity"]).astype(float)[selected],
         {"noise": int(noise.sum()), "withheld": int(withheld.sum())},
-        scan_angle=_scan_angle(cloud, header.point_format)[selected],
+        scan_angle=scan_angles(cloud)[selected],
         gps_time=_gps_time(cloud, selected),
         source=np.asarray(cloud["point_source_id"]).astype(int)[selected],
     )
     return points, system
-
-
-def _scan_angle(cloud: Any, point_format: int) -> np.ndarray:
-    """Return the scan angles of all points, degrees."""
-    if point_format >= _FORMAT_6:
-        return np.asarray(cloud["scan_angle"], float) * _SCAN_ANGLE_STEP
-    return np.asarray(cloud["scan_angle_rank"], float)
 
 
 def _gps_time(cloud: Any, selected: np.ndarray) -> np.ndarray | None:
@@ -156,17 +147,15 @@ def _gps_time(cloud: Any, selected: np.ndarray) -> np.ndarray | None:
 
 
 def import_laspy(purpose: str) -> Any:
-    """Return the package laspy. **Raises:** ImportError that names the purpose, "reading" or "writing"."""
-    try:
+    """Return the package laspy. **Raises:** ImportError that names the purpose."""
+    with required_for(purpose):
         import laspy
-    except ImportError as error:
-        raise ImportError(f'{purpose} LAS needs laspy: pip install "jaxlidar[io]"') from error
     return laspy
 
 
 def point_format_of(header: LasHeader) -> Any:
     """Return laspy's description of the point records of a file."""
-    laspy = import_laspy("reading")
+    laspy = import_laspy("reading LAS")
     point_format = laspy.PointFormat(header.point_format)
     if header.extra_bytes:
         point_format.add_extra_dimension(laspy.ExtraBytesParams("extra", f"{header.extra_bytes}u1"))
@@ -260,7 +249,7 @@ def las_points(
 
     **Raises:** ValueError for numbers that the point format does not hold.
     """
-    laspy = import_laspy("writing")
+    laspy = import_laspy("writing LAS")
     if len(position) == 0:
         raise ValueError("position holds no point; admissible is one or more")
     check_shape("position", position, (len(position), 3))
@@ -326,8 +315,9 @@ def scan_angles(points: Any) -> np.ndarray:
 
 def write_points(points: Any, path: Path, *, compressed: bool = False) -> None:
     """Write a `laspy.LasData`, compressed by lazrs or not. **Raises:** ImportError without lazrs."""
-    if compressed and not import_laspy("writing").LazBackend.detect_available():
-        raise ImportError('writing LAZ needs lazrs: pip install "jaxlidar[io]"')
+    if compressed:
+        with required_for("writing LAZ"):
+            import lazrs  # noqa: F401
     with path.open("wb") as file:
         points.write(file, do_compress=compressed)
 

@@ -1,12 +1,15 @@
 """Headers and variable length records of LAS and LAZ files; each size in them is compared with the file's.
 
+laspy (2.7) allocates and loops by the sizes that a header declares, reads the points before the end of a file
+that is cut short, and refuses files for text in records that nobody asks for.
+
 Source: LAS specification 1.4 (ASPRS). PulseWaves files have variable length records of the same kind.
 """
 
 import dataclasses
 import math
 import struct
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import BinaryIO, NamedTuple
 
@@ -33,7 +36,7 @@ ITEMS = {
 }
 ITEM_SIZES = {6: 20, 7: 8, 8: 6, 9: 29, 10: 30, 11: 6, 12: 8, 13: 29}
 # Admissible units of length in which coordinates are counted.
-_MIN_SCALE, _MAX_SCALE = 1e-9, 1e3
+_SCALES = (1e-9, 1e3)
 
 
 class VariableRecord(NamedTuple):
@@ -67,6 +70,21 @@ def variable_records(
                 f"{end} on"
             )
         yield VariableRecord(user.split(b"\0")[0], number, offset - length, length)
+
+
+def check_scales(
+    location: str,
+    axes: str,
+    scales: Sequence[float],
+    offsets: Sequence[float],
+    admissible: tuple[float, float],
+) -> None:
+    """Refuse scales of counted numbers outside a range, and offsets that are not finite."""
+    for axis, scale, offset in zip(axes, scales, offsets):
+        if not admissible[0] <= scale <= admissible[1]:
+            raise ValueError(f"{location}: scale of {axis} = {scale:g} is outside the range {admissible}")
+        if not math.isfinite(offset):
+            raise ValueError(f"{location}: offset of {axis} = {offset:g} is not finite")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -150,13 +168,7 @@ def read_header(path: Path, file: BinaryIO) -> LasHeader:
     header = LasHeader(format_byte & ~_COMPRESSED, point_size, points, start, scales, offsets)
     if header.point_format not in ITEMS or header.extra_bytes < 0:
         raise ValueError(f"{path}: header: point format {header.point_format}, records of {point_size} bytes")
-    for axis, scale, offset in zip("xyz", scales, offsets):
-        if not _MIN_SCALE <= scale <= _MAX_SCALE:
-            raise ValueError(
-                f"{path}: header: scale of {axis} = {scale:g} is outside the range {(_MIN_SCALE, _MAX_SCALE)}"
-            )
-        if not math.isfinite(offset):
-            raise ValueError(f"{path}: header: offset of {axis} = {offset:g} is not finite")
+    check_scales(f"{path}: header", "xyz", scales, offsets, _SCALES)
     if points == 0:
         raise ValueError(f"{path}: header: the file holds no points")
     ordinary = variable_records(path, file, _RECORD_HEADER, header_size, start, records, "points")

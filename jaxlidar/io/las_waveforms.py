@@ -148,7 +148,7 @@ class _LasShots(AirborneShots):
     """
 
     def __init__(self, path: Path):
-        laspy = import_laspy("reading")
+        laspy = import_laspy("reading LAS")
         self.path, self.tables = path, {}
         with path.open("rb") as file:
             header = read_header(path, file)
@@ -538,7 +538,7 @@ def write_las_waveforms(
         fields = {name: np.concatenate(values) for name, values in writer.fields.items()}
         points = las_points(point_format, np.concatenate(writer.positions), fields, writer.system)
         points.header.global_encoding.waveform_data_packets_external = True
-        laspy = import_laspy("writing")
+        laspy = import_laspy("writing LAS")
         for layout, number in writer.layouts.items():
             record = laspy.VLR(_USER.decode(), _BEFORE_FIRST_LAYOUT + number, "", _LAYOUT.pack(*layout))
             points.header.vlrs.append(record)

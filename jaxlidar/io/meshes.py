@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jaxlidar._fields.checks import check_choice, check_number
-from jaxlidar.io.checks import MAX_COORDINATE, existing_file
+from jaxlidar.io.checks import MAX_COORDINATE, existing_file, required_for
 from jaxlidar.io.coordinates import unit_length
 from jaxlidar.io.text import parse_integer, parse_number, read_lines
 from jaxlidar.plants.meshes import Mesh
@@ -192,12 +192,8 @@ def _unit(path: Path, lines: list[str]) -> float | None:
 
 def _read_other(path: Path, part: str, uses_unit: bool) -> _StoredMesh:
     """Return the triangles of all nodes of a file that trimesh reads."""
-    try:
+    with required_for(f"reading {path.suffix} files"):
         import trimesh
-    except ImportError as error:
-        raise ImportError(
-            f'{path.suffix} files need the package trimesh: pip install "jaxlidar[io]"'
-        ) from error
     lines = _check_text(path)
     try:
         scene = trimesh.load_scene(path, process=False)

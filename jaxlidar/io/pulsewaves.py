@@ -42,7 +42,7 @@ from jaxlidar.io.coordinates import (
     geographic_lines,
     system_of_name,
 )
-from jaxlidar.io.las_header import variable_records
+from jaxlidar.io.las_header import check_scales, variable_records
 
 # The header: signature, version, sizes, counts of records; then scale and offset of times, and those of
 # coordinates.
@@ -69,7 +69,7 @@ _TABLE_HEADER, _TABLE = struct.Struct("<I4xI64x"), struct.Struct("<I4xIHBBI64x")
 _NO_ORIGIN = 0x8FFFFFFF
 _OUTGOING, _RETURNING = 1, 2
 # Admissible units in which times and coordinates are counted.
-_MIN_SCALE, _MAX_SCALE = 1e-12, 1e3
+_SCALES = (1e-12, 1e3)
 # Most entries of a table of amplitudes: as many as there are counts of 16 bits.
 _MAX_ENTRIES = 65536
 # Fields of a pulse record. Further bytes may follow.
@@ -413,13 +413,7 @@ def _read_header(path: Path, file: BinaryIO) -> PulsesHeader:
     time_scale, time_offset = _TIME_SCALE.unpack_from(block, _HEADER.size)
     coordinates = np.array(_COORDINATE_SCALES.unpack_from(block, _HEADER.size + _TIME_SCALE.size))
     scales, offsets = (time_scale, *coordinates[:3]), (time_offset, *coordinates[3:])
-    for axis, scale, offset in zip("txyz", scales, offsets):
-        if not _MIN_SCALE <= scale <= _MAX_SCALE:
-            raise ValueError(
-                f"{location}: scale of {axis} = {scale:g} is outside the range {(_MIN_SCALE, _MAX_SCALE)}"
-            )
-        if not math.isfinite(offset):
-            raise ValueError(f"{location}: offset of {axis} = {offset:g} is not finite")
+    check_scales(location, "txyz", scales, offsets, _SCALES)
     contents = dict(_record_contents(path, file, header_size, start, records))
     if appended:
         contents |= _appended_contents(path, file, start + count * pulse_size, size)

@@ -9,7 +9,8 @@ import numpy as np
 from jaxtyping import ArrayLike
 
 from jaxlidar._fields.checks import as_numpy, check_kind, check_number, check_range, check_shape
-from jaxlidar.io.coordinates import import_rasterio, metric_system
+from jaxlidar.io.checks import required_for
+from jaxlidar.io.coordinates import metric_system
 from jaxlidar.io.files import atomic_write
 
 _TIFF = (".tif", ".tiff")
@@ -66,7 +67,8 @@ def write_raster(
     >>> print(terrain.origin.tolist(), terrain.heights[:, 0].tolist())
     [0.0, 0.0] [18.0, 17.5, 19.0]
     """
-    rasterio = import_rasterio("GeoTIFF files")
+    with required_for("writing GeoTIFF"):
+        import rasterio
     path = Path(path)
     if path.suffix.lower() not in _TIFF:
         raise ValueError(f"path = {path} ends in {path.suffix!r}; admissible are {', '.join(_TIFF)}")

@@ -17,6 +17,7 @@ from jaxtyping import Float, Shaped
 
 from jaxlidar._fields.checks import check_choice, check_kind
 from jaxlidar._fingerprint import version_of
+from jaxlidar.io.checks import required_for
 from jaxlidar.io.files import atomic_write
 from jaxlidar.io.hdf5 import rows_in_order
 
@@ -206,8 +207,8 @@ class ShotTable:
 
         **Raises:** ImportError without xarray, which the extra `io` installs.
         """
-        import xarray
-
+        with required_for("making datasets"):
+            import xarray
         variables: dict[str, Any] = {}
         coordinates: dict[str, Any] = {}
         for name, column in self.columns.items():
@@ -283,16 +284,10 @@ def _printed(value: Any) -> str:
     return text if len(text) <= _WIDTH else f"{text[: _WIDTH - 1]}…"
 
 
-def _missing_package(name: str) -> str:
-    return f"writing this format needs {name}: pip install 'jaxlidar[io,tables]'"
-
-
 def _write_netcdf(table: ShotTable, path: Path) -> None:
-    try:
-        dataset = table.to_xarray()
-    except ImportError as error:
-        raise ImportError(_missing_package("xarray and h5netcdf")) from error
-    dataset.to_netcdf(path, engine="h5netcdf")
+    with required_for("writing netCDF"):
+        import h5netcdf  # noqa: F401
+    table.to_xarray().to_netcdf(path, engine="h5netcdf")
 
 
 def _write_csv(table: ShotTable, path: Path) -> None:
@@ -306,11 +301,9 @@ def _write_csv(table: ShotTable, path: Path) -> None:
 
 
 def _write_parquet(table: ShotTable, path: Path) -> None:
-    try:
+    with required_for("writing Parquet", "tables"):
         import pyarrow  # pyright: ignore[reportMissingImports]
         from pyarrow import parquet  # pyright: ignore[reportMissingImports]
-    except ImportError as error:
-        raise ImportError(_missing_package("pyarrow")) from error
     fields, arrays = [], []
     for name, column in table.flat().items():
         array = pyarrow.array(column.values)
@@ -322,10 +315,8 @@ def _write_parquet(table: ShotTable, path: Path) -> None:
 
 
 def _write_geopackage(table: ShotTable, path: Path) -> None:
-    try:
+    with required_for("writing GeoPackage", "tables"):
         import pyogrio.raw  # pyright: ignore[reportMissingImports]
-    except ImportError as error:
-        raise ImportError(_missing_package("pyogrio")) from error
     for name in _COORDINATES:
         if name not in table:
             raise ValueError(f"{path}: the table has no {name}: a GeoPackage has points")

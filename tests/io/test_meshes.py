@@ -279,5 +279,5 @@ def test_other_endings_and_packages(tmp_path, monkeypatch):
         read_mesh(tmp_path / "b.ply")
     (tmp_path / "a.ply").write_text(PLY.format(unit="m"))
     monkeypatch.setitem(sys.modules, "trimesh", None)
-    with pytest.raises(ImportError, match=r"\.ply files need the package trimesh: pip install"):
+    with pytest.raises(ImportError, match=r"reading \.ply files needs trimesh: pip install"):
         read_mesh(tmp_path / "a.ply")
