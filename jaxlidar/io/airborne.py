@@ -86,7 +86,7 @@ class Returns(NamedTuple):
     **Example:**
 
     >>> import numpy as np
-    >>> from jaxlidar.io import Returns
+    >>> from jaxlidar.io.airborne import Returns
     >>> one, place = np.array([1]), np.array([[0.0, 0.0, 12.5]])
     >>> Returns(place, np.array([4.0]), np.array([310]), one, one, np.array([2])).position[0, 2]
     np.float64(12.5)
@@ -110,7 +110,7 @@ class Scanner(NamedTuple):
 
     **Example:**
 
-    >>> from jaxlidar.io import Scanner
+    >>> from jaxlidar.io.airborne import Scanner
     >>> Scanner("Q680i", "9997848", wavelength=1550.0).divergence is None
     True
     """
@@ -445,7 +445,7 @@ class ShotStack(NamedTuple):
     **Example:**
 
     >>> import numpy as np
-    >>> from jaxlidar.io import ShotStack
+    >>> from jaxlidar.io.airborne import ShotStack
     >>> stack = ShotStack(np.arange(3.0), np.array([[0.0, 80.0, 2.0]]), np.full((1, 3), True))
     >>> noise = np.where(stack.recorded, 1.5, np.inf)
     """

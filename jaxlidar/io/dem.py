@@ -54,7 +54,7 @@ class DemRead(NamedTuple):
     **Example:**
 
     >>> import jaxlidar as jl
-    >>> from jaxlidar.io import DemRead
+    >>> from jaxlidar.io.dem import DemRead
     >>> terrain, crs, filled = DemRead(jl.Terrain([[0.0, 1.0], [0.0, 1.0]], 1.0), "EPSG:32633", 0)
     >>> print(terrain.heights.shape, crs)
     (2, 2) EPSG:32633

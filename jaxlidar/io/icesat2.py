@@ -62,7 +62,7 @@ class PhotonImpulse(NamedTuple):
     **Example:**
 
     >>> import numpy as np
-    >>> from jaxlidar.io import PhotonImpulse
+    >>> from jaxlidar.io.icesat2 import PhotonImpulse
     >>> impulse = PhotonImpulse(np.array([-0.5, 0.0, 0.5]), np.array([0.25, 0.5, 0.25]))
     >>> print(f"{np.sqrt(np.sum(impulse.power * impulse.time**2)):.2f} ns")
     0.35 ns
@@ -100,7 +100,7 @@ class PhotonTrack:
     **Example:** two photons of one segment.
 
     >>> import numpy as np
-    >>> from jaxlidar.io import PhotonTrack
+    >>> from jaxlidar.io.icesat2 import PhotonTrack
     >>> two, one = np.zeros(2), np.zeros(1)
     >>> numbers = {"pulse": two.astype(int), "confidence": np.array([0, 4]), "quality": two.astype(int)}
     >>> place = {"distance": np.array([3.0, 3.7]), "height": np.array([250.0, 212.0]), "time": two}

@@ -59,7 +59,7 @@ class NeonImpulse(NamedTuple):
     **Example:**
 
     >>> import numpy as np
-    >>> from jaxlidar.io import NeonImpulse
+    >>> from jaxlidar.io.neon import NeonImpulse
     >>> ns = np.array([-1.0, 0.0, 1.0])
     >>> impulse = NeonImpulse(ns, np.array([30.0, 60.0, 30.0]), ns, np.array([20.0, 80.0, 20.0]))
     >>> print(f"{impulse.power.sum() / impulse.pulse_power.sum():.1f}")
@@ -82,7 +82,7 @@ class NeonRead(NamedTuple):
     **Example:**
 
     >>> import numpy as np
-    >>> from jaxlidar.io import NeonImpulse, NeonRead
+    >>> from jaxlidar.io.neon import NeonImpulse, NeonRead
     >>> impulse = NeonImpulse(*np.array([[-1.0, 0.0], [30.0, 60.0], [-1.0, 0.0], [20.0, 80.0]]))
     >>> read = NeonRead([], impulse, {"without a return": 2, "without a pulse": 0})
     >>> sum(read.dropped.values())

@@ -43,7 +43,7 @@ class TreeRead(NamedTuple):
     **Example:**
 
     >>> import jaxlidar as jl
-    >>> from jaxlidar.io import TreeRead
+    >>> from jaxlidar.io.qsm import TreeRead
     >>> tree, dropped = TreeRead(jl.grow(jl.shrub()), {"without a length": 0})
     >>> print(tree.height > 0, dropped)
     True {'without a length': 0}

@@ -40,7 +40,7 @@ class ColumnAxis(NamedTuple):
     **Example:**
 
     >>> import numpy as np
-    >>> from jaxlidar.io import ColumnAxis
+    >>> from jaxlidar.io.tables import ColumnAxis
     >>> ColumnAxis("layer", np.array([2.5, 7.5]), "m").name
     'layer'
     """

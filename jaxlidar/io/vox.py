@@ -44,7 +44,7 @@ class VoxelsRead(NamedTuple):
 
     >>> import numpy as np
     >>> import jaxlidar as jl
-    >>> from jaxlidar.io import VoxelsRead
+    >>> from jaxlidar.io.vox import VoxelsRead
     >>> leaves = jl.VoxelMap.from_lad(np.ones((1, 1, 2)), voxel_size=1.0)
     >>> voxels, dropped = VoxelsRead(leaves, {"not sampled": 0})
     >>> print(voxels.shape, dropped)
