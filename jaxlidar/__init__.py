@@ -83,7 +83,6 @@ from jaxlidar._fields.checks import UnitWarning
 from jaxlidar._fingerprint import version_of
 from jaxlidar._jax.compilation_cache import compilation_cache
 from jaxlidar._jax.workers import LostWorkersWarning
-from jaxlidar._progress import Progress
 from jaxlidar._registry import register_public_objects, waveform_html
 from jaxlidar.io.netcdf import open, rerun
 from jaxlidar.optics.coefficients import load_coefficients
@@ -108,6 +107,7 @@ from jaxlidar.plants.stand import Stand
 from jaxlidar.plants.tree import Tree
 from jaxlidar.plants.turtle import turtle
 from jaxlidar.plants.voxelise import voxelise, voxelise_points
+from jaxlidar.progress import Progress
 from jaxlidar.scenes.atmosphere import Atmosphere
 from jaxlidar.scenes.canopy import Canopy
 from jaxlidar.scenes.mesh_surface import MeshInstances, MeshSurface

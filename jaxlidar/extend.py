@@ -18,7 +18,8 @@ For laws, pulses and surfaces of your own, and for packages on top such as `inve
   expression that uses them.
 - `einsum`, `matmul` and `tensordot` are those of `jax.numpy`, in full precision on every device: by default,
   GPUs round their factors.
-- `side_by_side` runs compiled programs on as many threads as there are cores; compile them with `ONE_CORE`.
+- `side_by_side` runs compiled programs on as many threads as there are cores; compile them as a
+  `Program` with `one_core=True`.
 - `outcomes` runs the tasks that `task` makes, in this process or by the workers of an executor.
 """
 
@@ -40,7 +41,8 @@ from jaxlidar._fields.ranges import Range, check_ranges, inadmissible, reasons
 from jaxlidar._fingerprint import fingerprint
 from jaxlidar._jax.one_function import barrier
 from jaxlidar._jax.products import einsum, matmul, tensordot
-from jaxlidar._jax.threads import ONE_CORE, side_by_side
+from jaxlidar._jax.programs import Program
+from jaxlidar._jax.threads import side_by_side
 from jaxlidar._jax.workers import outcomes, task
 from jaxlidar._vectors import (
     Scalar,
@@ -58,7 +60,7 @@ from jaxlidar._vectors import (
 from jaxlidar.scenes.scene import check_kinds
 
 __all__ = [
-    "ONE_CORE",
+    "Program",
     "Range",
     "Scalar",
     "Vec",

@@ -21,7 +21,7 @@ def set_flags() -> None:
 
 def optimise_programs() -> None:
     """Have the package's own programs optimised a little, if XLA_FLAGS has the options of the tests."""
-    from jaxlidar.extend import ONE_CORE
+    from jaxlidar._jax.threads import ONE_CORE
 
     if os.environ.get("XLA_FLAGS") == FLAGS:
         ONE_CORE["compiler_options"]["xla_backend_optimization_level"] = 1

@@ -31,6 +31,7 @@ ROOT = Path(__file__).resolve().parents[1]
 # Packages and top-level modules of jaxlidar, the lowest first: each may import itself and those that stand
 # before it in this table. A new package needs one line here.
 LAYERS = (
+    "progress",
     "optics",
     "sensors",
     "scenes",

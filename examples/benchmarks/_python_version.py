@@ -13,7 +13,7 @@ from _common import best, race
 from simulation_cost import LIDAR, ORDERS, WINDOW, scenes
 
 import jaxlidar as jl
-from jaxlidar.extend import ONE_CORE
+from jaxlidar.extend import Program
 
 KEY, ROUNDS = jax.random.key(0), 9
 TRAITS = {"N": 1.8, "Cab": 40.0, "Car": 8.0, "Cant": 1.0, "Cbrown": 0.1, "Cw": 0.01, "Cm": 0.009}
@@ -46,9 +46,9 @@ def main() -> None:
         return jl.total_reflectance(jl.trace_scene(setup, KEY, reverse=reverse), setup)
 
     # With the options by which `simulate` compiles its batches.
-    traced = eqx.filter_jit(trace, **ONE_CORE)
+    traced = Program(trace, one_core=True)
     jacobian, reverse_jacobian = (
-        jax.jit(jax.jacfwd(functools.partial(total, reverse=r)), **ONE_CORE) for r in (False, True)
+        Program(jax.jacfwd(functools.partial(total, reverse=r)), one_core=True) for r in (False, True)
     )
     heights = jnp.array([0.0, 1.0])
     leaves = jax.vmap(lambda n: jl.Prospect(**{**TRAITS, "N": n}))(jnp.linspace(1.2, 2.4, LEAVES))

@@ -22,7 +22,7 @@ with one degree of freedom (Wilks 1938, Ann. Math. Stat. 9, 60).
 
 import dataclasses
 import itertools
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any, final
 
 import equinox as eqx
@@ -35,7 +35,7 @@ from inversion.fit.fit_summary import CompletedFit
 from inversion.fit.model import ForwardModel
 from inversion.fit.prior_residuals import fixed_priors
 from inversion.fit.problem import Problem, check_problem
-from inversion.fit.retrieval import check_progress, fit_record, solver_settings
+from inversion.fit.retrieval import fit_record, solver_settings
 from inversion.fit.uncertainty import correlation_of, estimate_covariance
 from inversion.fit.unknowns import (
     BoundUnknown,
@@ -49,6 +49,7 @@ from inversion.fit.unknowns import (
     with_start,
 )
 from jaxlidar.extend import as_numpy, check_key, check_range
+from jaxlidar.progress import ProgressOption, shows_progress
 
 # Unknowns whose correlation exceeds this are named in the summary.
 _HIGH_CORRELATION = 0.95
@@ -229,6 +230,7 @@ class Profile(eqx.Module):
         return end(range(best, -1, -1)), end(range(best, len(root_chi2)))
 
 
+@shows_progress
 def profile_likelihood(
     problem: Problem,
     name: str,
@@ -237,7 +239,7 @@ def profile_likelihood(
     key: PRNGKeyArray,
     max_steps: int = 50,
     starts: int = 1,
-    progress: Callable[[int], None] | None = None,
+    progress: ProgressOption = None,
 ) -> Profile:
     """Profile likelihood of one unknown: all others are fitted at each of several fixed values of it.
 
@@ -252,7 +254,8 @@ def profile_likelihood(
       before the others.
     - `values`: (points,) values of that unknown, two or more, increasing, within its bounds.
     - `key`, `max_steps`, `starts`: as for `retrieve`.
-    - `progress`: called with the index of each value when its fit has ended.
+    - `progress`: True for a bar; or a function called with the index of each value when its fit has ended.
+      Default None: silent.
 
     **Returns:** a `Profile`.
 
@@ -273,7 +276,6 @@ def profile_likelihood(
     0.47 m to 0.53 m
     """
     check_problem(problem)
-    check_progress(progress)
     check_key(key)
     settings, bound = solver_settings(max_steps, starts), problem.bound
     lidar, scene, unknowns = bound.lidars[0], bound.scenes[0], bound.unknowns[0]
@@ -311,7 +313,7 @@ def profile_likelihood(
             fits[i] = fit_record(problem_at_point, settings, key).fit
             estimates[i] = split_by_name(fits[i].summary.values, problem_at_point.all_unknowns)
             neighbour = estimates[i]
-            if progress is not None:
+            if callable(progress):
                 progress(i)
     # From the order in which fits ran to that of the values.
     ordered = [fits[i] for i in range(points.size)]

@@ -51,7 +51,7 @@ from jaxlidar import (
     trace_scene,
     waveform_of,
 )
-from jaxlidar.extend import ONE_CORE, concrete, side_by_side
+from jaxlidar.extend import Program, concrete, side_by_side
 from jaxlidar.planning.memory import format_bytes, memory_limit, scored_bytes
 from jaxlidar.planning.plan_check import is_in_reach
 from jaxlidar.planning.setup import Setup
@@ -163,7 +163,7 @@ def _extinction_tables(scene: Any) -> list[Any]:
     return [table for table in (voxels.leaf, voxels.bark) if table is not None]
 
 
-@eqx.filter_jit
+@Program
 def _moved_voxels(
     scene: Scene, values: Values, setters: tuple[Setter, ...], direction: Values
 ) -> Bool[Array, "nx ny nz"]:
@@ -335,11 +335,11 @@ def _value_and_tangents(
 
 
 # One core each: batches run side by side on threads.
-_compiled_trace_batch = eqx.filter_jit(_trace_batch, **ONE_CORE)
-_compiled_slopes = eqx.filter_jit(_extinction_slopes)
+_compiled_trace_batch = Program(_trace_batch, one_core=True)
+_compiled_slopes = Program(_extinction_slopes)
 
 
-@eqx.filter_jit
+@Program
 def _apply_optics(
     inputs: SimulationInputs, values: Values, response: Response
 ) -> tuple[Float[Array, "wavelengths bins"], Float[Array, "columns wavelengths bins"]]:
@@ -356,12 +356,12 @@ def _apply_optics(
     return push(jnp.eye(flat.size, dtype=flat.dtype))
 
 
-@eqx.filter_jit
+@Program
 def _as_waveform(inputs: SimulationInputs, values: Values, response: Response, stderr: Array) -> Waveform:
     return waveform_of(response, inputs.setup(values), stderr=stderr)
 
 
-@jax.jit
+@Program
 def _mean_response(responses: list[Any]) -> Any:
     return jax.tree.map(lambda *a: sum(a) / len(a), *responses)
 

@@ -1,7 +1,7 @@
 """Retrieval of scene properties from one record."""
 
 import dataclasses
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import jax
@@ -10,7 +10,7 @@ from jax.core import Tracer
 from jaxtyping import PRNGKeyArray
 
 from inversion.fit.data import as_noise, as_sample_times, with_fixed_window
-from inversion.fit.fit_summary import CompletedFit, Step, SummarySizes
+from inversion.fit.fit_summary import CompletedFit, SummarySizes
 from inversion.fit.implicit_differentiation import (
     DifferentiableFit,
     DifferentiatedModel,
@@ -36,18 +36,20 @@ from inversion.fit.unknowns import bind_unknowns, smooth_names
 from inversion.receiver.recorder import Recorder
 from jaxlidar import Lidar, Scene, Waveform, trace_scene, waveform_of
 from jaxlidar.extend import check_integer, check_key, check_kinds
+from jaxlidar.progress import ProgressOption, shows_progress
 
 # Programs have no sentences; neither do they have a status.
 _STATUS_IN_PROGRAM = "fitted within a compiled program, which does not tell how the fit ended"
 
 
+@shows_progress
 def retrieve(
     problem: Problem,
     *,
     key: PRNGKeyArray,
     max_steps: int = 50,
     starts: int = 1,
-    progress: Callable[[Step], None] | None = None,
+    progress: ProgressOption = None,
     throw: bool = False,
 ) -> Retrieval:
     """Retrieve the unknowns of a problem of one record, with standard errors, by nonlinear least squares.
@@ -82,8 +84,9 @@ def retrieve(
       with few photons. Default 50.
     - `starts`: number of starting points; the best fit is returned. The first is that of the unknowns
       (`Unknown.start`), the others are a Latin hypercube over the bounds. Default 1.
-    - `progress`: called with a `Step` after every trial, with few photons or all, and again when a descent
-      starts anew, with new weights or strengths of priors; for instance `print`.
+    - `progress`: True for a bar with the latest step; or a function called with a `Step` after every trial,
+      with few photons or all, and again when a descent starts anew, with new weights or strengths of priors.
+      Default None: silent.
     - `throw`: raise RuntimeError if the fit does not converge. Default False: only `Retrieval.status` says
       so.
 
@@ -108,7 +111,6 @@ def retrieve(
     """
     check_problem(problem)
     check_key(key)
-    check_progress(progress)
     settings = solver_settings(max_steps, starts)
     inputs = FitInputs.of(problem, key)
     if not inputs.is_traced:
@@ -148,7 +150,7 @@ def fit_record(
     settings: SolverSettings,
     key: PRNGKeyArray,
     *,
-    progress: Callable[[Step], None] | None = None,
+    progress: ProgressOption = None,
     throw: bool = False,
 ) -> FittedRecord:
     """Fit the record of a problem. **Raises:** RuntimeError with `throw`, if the fit does not converge."""
@@ -174,7 +176,7 @@ def fit_with_derivatives(
     settings: SolverSettings,
     key: PRNGKeyArray,
     *,
-    progress: Callable[[Step], None] | None = None,
+    progress: ProgressOption = None,
     throw: bool = False,
 ) -> tuple[DifferentiableFit, DifferentiatedModel]:
     """Fit the record of a problem, with the derivatives of its estimates."""
@@ -246,9 +248,3 @@ def retrieval_of_record(problem: BoundProblem, fitted: FittedRecord) -> Retrieva
 def solver_settings(max_steps: int, starts: int) -> SolverSettings:
     """Check the numbers of a fit. **Raises:** ValueError for inadmissible ones."""
     return SolverSettings(check_integer("max_steps", max_steps), check_integer("starts", starts))
-
-
-def check_progress(progress: object) -> None:
-    """Refuse a `progress` that is neither None nor callable. **Raises:** TypeError."""
-    if not (progress is None or callable(progress)):
-        raise TypeError(f"progress = {progress!r} is no function")

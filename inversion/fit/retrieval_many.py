@@ -15,8 +15,9 @@ fit of a footprint depends neither on `lanes` nor on the executor.
 
 import contextlib
 import dataclasses
+import functools
 import os
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from time import perf_counter
 from typing import Any, NamedTuple
@@ -32,7 +33,7 @@ from inversion.fit.model import Evaluation, ForwardModel, SimulationInputs, eval
 from inversion.fit.planning import trace_sizes
 from inversion.fit.problem import BoundProblem, Problem, check_problem
 from inversion.fit.result import Retrievals, retrievals_of
-from inversion.fit.retrieval import check_progress, solver_settings
+from inversion.fit.retrieval import solver_settings
 from inversion.fit.solver import (
     EvaluationRequest,
     FitGenerator,
@@ -45,7 +46,7 @@ from inversion.fit.solver import (
 from inversion.fit.unknowns import BoundUnknown
 from jaxlidar import Lidar, Progress, Scene
 from jaxlidar.extend import (
-    ONE_CORE,
+    Program,
     check_integer,
     check_key,
     check_kind,
@@ -56,6 +57,7 @@ from jaxlidar.extend import (
     warn_user,
 )
 from jaxlidar.io.store import ResultStore, dataset_of_rows, open_store
+from jaxlidar.progress import ProgressOption, shows_progress
 
 # Fits of a chunk of the store. A chunk of each quantity is a file: few files, and small ones to rewrite.
 _FITS_PER_CHUNK = 16
@@ -64,6 +66,7 @@ _FITS_PER_CHUNK = 16
 _GROUPS_PER_CHUNK = 4
 
 
+@shows_progress
 def retrieve_many(
     problem: Problem,
     *,
@@ -73,7 +76,7 @@ def retrieve_many(
     lanes: int = 16,
     path: str | os.PathLike[str] | None = None,
     executor: Executor | None = None,
-    progress: Callable[[Progress], None] | None = None,
+    progress: ProgressOption = None,
 ) -> Retrievals:
     """Retrieve the unknowns of a problem of many records, from each separately, as `retrieve` does from one.
 
@@ -95,7 +98,8 @@ def retrieve_many(
     - `executor`: a `concurrent.futures.Executor`, whose workers fit chunks of records, as for
       `jaxlidar.simulate_many`. Unknowns are sent to them: give paths, or functions of a module. A chunk whose
       worker dies gets a second try. Default None: this process.
-    - `progress`: called with a `Progress` after every fit.
+    - `progress`: True for a bar with the time left; or a function called with a `Progress` after every fit.
+      Default None: silent.
 
     **Returns:** a `Retrievals`, which does not depend on the number of workers.
 
@@ -120,7 +124,6 @@ def retrieve_many(
     """
     check_problem(problem, many=True)
     check_key(key)
-    check_progress(progress)
     check_kind("path", path, str | os.PathLike | None, "a path, or None")
     check_kind("executor", executor, Executor | None, "a concurrent.futures.Executor, or None")
     lanes = check_integer("lanes", lanes)
@@ -161,7 +164,7 @@ def retrieve_many(
         )
         for i, summary in fits:
             finished.add(i, summary)
-            if progress is not None:
+            if callable(progress):
                 n_converged = sum(fit.converged for fit in finished.summaries.values())
                 counts = len(finished.summaries), n_footprints
                 progress(Progress(*counts, perf_counter() - start_time, "fits", n_stored, n_converged))
@@ -360,7 +363,7 @@ class HasFootprintAxis(NamedTuple):
     scene: bool
 
 
-@eqx.filter_jit(**ONE_CORE)
+@functools.partial(Program, one_core=True)
 def _evaluate_in_lockstep(
     inputs: SimulationInputs, values: Any, keys: Array, n_batches: Array, has_axis: HasFootprintAxis
 ) -> tuple[Array, Array, Array]:

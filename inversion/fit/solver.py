@@ -59,6 +59,7 @@ from inversion.fit.unknowns import (
     flat_start,
     split_by_name,
 )
+from jaxlidar.progress import ProgressOption
 
 # Pilot evaluations have noise that hides smaller steps; the fit then goes on with all batches.
 _SOLVER = BoundedGaussNewton()
@@ -184,7 +185,7 @@ class LeastSquaresFit:
         scene_unknowns: list[BoundUnknown],
         recorder_model: RecorderModel,
         settings: SolverSettings,
-        progress: Callable[[Step], None] | None = None,
+        progress: ProgressOption = None,
         start: np.ndarray | None = None,
     ):
         self.observed, self.is_fitted, self.recorder_model = observed, observed.is_fitted, recorder_model
@@ -350,7 +351,7 @@ class LeastSquaresFit:
         degrees_of_freedom = max(iterate.difference.size - self.low.size, 1)
         chi2 = float(np.sum(self.noise.whiten(iterate.difference) ** 2)) / degrees_of_freedom
         self.history.append(chi2)
-        if self.progress is not None:
+        if callable(self.progress):
             values = split_by_name(iterate.values, self.unknowns)
             self.progress(Step(len(self.history), chi2, accepted, values))
 
@@ -509,7 +510,7 @@ def fits_from_starts(
     recorder_model: RecorderModel,
     settings: SolverSettings,
     key: PRNGKeyArray,
-    progress: Callable[[Step], None] | None = None,
+    progress: ProgressOption = None,
 ) -> list[LeastSquaresFit]:
     """Return a fit from the unknowns' own start, and further ones from a Latin hypercube over the bounds.
 

@@ -21,7 +21,7 @@ relief within the footprint does to the ground's echo.
 
 import dataclasses
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -36,6 +36,7 @@ from inversion.fit.retrieval_many import retrieve_many
 from inversion.fit.unknowns import Unknown
 from inversion.metrics.gedi import RECEIVER_SMOOTHING, judge_shot
 from inversion.scene.layered_canopy import LAYERS, LayeredCanopy
+from jaxlidar.progress import ProgressOption, shows_progress
 
 CANOPY = LayeredCanopy(clearance=1.0)
 # Samples above and below the reference: of 1 ns, or 0.15 m.
@@ -170,13 +171,14 @@ def start_grounds(ground: float, lowest_mode: float) -> list[float]:
     return [float(ground), float(lowest_mode)] if is_other else [float(ground)]
 
 
+@shows_progress
 def fit_gedi_shots(
     shots: Sequence[Any],
     ground: Float[np.ndarray, " shots"],
     lowest_mode: Float[np.ndarray, " shots"],
     *,
     path: str | os.PathLike[str] | None = None,
-    progress: Callable[[jl.Progress], None] | None = None,
+    progress: ProgressOption = None,
 ) -> GediFits:
     """Fit shots, some of them from two grounds, all in one batch.
 
@@ -241,7 +243,7 @@ def _prepare(shot: Any, ground: float, lowest_mode: float) -> list[PreparedShot]
 def _fit(
     prepared: list[PreparedShot],
     path: str | os.PathLike[str] | None,
-    progress: Callable[[jl.Progress], None] | None,
+    progress: ProgressOption,
 ) -> Retrievals:
     """Fit prepared shots in one batch."""
     size = max(np.size(p.shot.pulse_time) for p in prepared)

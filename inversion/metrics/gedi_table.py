@@ -28,7 +28,7 @@ lengths, compiles each program once.
 
 import os
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -63,6 +63,7 @@ from jaxlidar.io import Column, GediShot, ShotTable
 from jaxlidar.io.gedi import IncompleteShot, read_gedi_rows
 from jaxlidar.io.store import check_store_path
 from jaxlidar.io.tables import ColumnAxis
+from jaxlidar.progress import ProgressOption, shows_progress
 from jaxlidar.survey.records import size_bucket
 
 # Setting groups of the product, and shots that are computed at once.
@@ -93,6 +94,7 @@ _EDGES = 5.0 * np.arange(31)
 _RH_AXIS = ColumnAxis("percentile", np.arange(101.0), "percent")
 
 
+@shows_progress
 def gedi_table(
     shots: Any,
     *,
@@ -103,7 +105,7 @@ def gedi_table(
     clumping: float = 1.0,
     fit: bool = False,
     path: str | os.PathLike[str] | None = None,
-    progress: Callable[[Progress], Any] | None = None,
+    progress: ProgressOption = None,
 ) -> ShotTable:
     """Return a table of GEDI shots: ground, relative heights, cover and plant area, with standard errors.
 
@@ -124,7 +126,8 @@ def gedi_table(
     - `fit`: also fit a layered canopy over sloping ground to each shot, see below. Default False.
     - `path`: a Zarr store of every fit that has ended, as for `inversion.retrieve_many`: the same call
       continues with it. Default None: no store.
-    - `progress`: called with a `Progress` after each batch of shots, and after each fit. Default None.
+    - `progress`: True for a bar; or a function called with a `Progress` after each batch of shots, and after
+      each fit. Default None: silent.
 
     **Returns:** a `jaxlidar.io.ShotTable`, a row for each shot in their order, with
 
@@ -210,7 +213,7 @@ def gedi_table(
         computed = _estimate([rows[i] for i in batch], padded_size, group, structure)
         for name, values in computed.items():
             estimates[name][batch] = values
-        if progress is not None:
+        if callable(progress):
             seconds = time.perf_counter() - start_time
             progress(Progress(int(first + batch.size), int(usable.size), seconds))
     verdicts = [_verdict_after(verdict, estimates, i) for i, verdict in enumerate(verdicts)]
@@ -599,7 +602,7 @@ def _fit_columns(
     estimates: dict[str, np.ndarray],
     verdicts: list[Verdict],
     path: str | os.PathLike[str] | None,
-    progress: Callable[[Progress], Any] | None,
+    progress: ProgressOption,
 ) -> tuple[dict[str, Column], dict[str, str]]:
     """Return the columns of fits, and the attributes that describe them.
 

@@ -37,7 +37,7 @@ and Yuille (2010), NeurIPS 23; Bardsley et al. (2014), SIAM J. Sci. Comput. 36, 
 import contextlib
 import dataclasses
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -48,7 +48,6 @@ from scipy.sparse import linalg as sparse_linalg
 
 from inversion.fit.data import as_noise, as_sample_times, with_fixed_window
 from inversion.fit.planning import TraceSizes, plan_for_bounds
-from inversion.fit.retrieval import check_progress
 from inversion.fit.unknowns import (
     BoundUnknown,
     Setter,
@@ -73,6 +72,7 @@ from jaxlidar.extend import (
     fingerprint,
 )
 from jaxlidar.io.store import ResultStore, dataset_of_rows, open_store
+from jaxlidar.progress import ProgressOption, shows_progress
 
 # Rays of a footprint unless they are given: one for each column of voxels in it, within limits; photons.
 _RAYS, _PHOTONS = (32, 512), 2048
@@ -114,6 +114,7 @@ class SceneStep:
         return f"{self.stage} {self.number}: misfit {self.misfit:.4g}{held_out}"
 
 
+@shows_progress
 def retrieve_scene(
     waveforms: Waveforms | ArrayLike | Sequence,
     survey: Survey,
@@ -135,7 +136,7 @@ def retrieve_scene(
     n_rays: int | None = None,
     n_photons: int | None = None,
     path: str | os.PathLike[str] | None = None,
-    progress: Callable[[SceneStep], None] | None = None,
+    progress: ProgressOption = None,
 ) -> SceneRetrieval:
     """Retrieve one scene from the records of all shots of a survey together.
 
@@ -188,7 +189,8 @@ def retrieve_scene(
       within 32 and 512; 2048 photons.
     - `path`: a Zarr store, whose name ends in ".zarr". A run that was interrupted goes on from its last step,
       draw or kernel. Only `progress` may change. Default None: no store.
-    - `progress`: called with a `SceneStep` after every step. Default None.
+    - `progress`: True for a bar with the latest step; or a function called with a `SceneStep` after every
+      step. Default None: silent.
 
     **Returns:** a `SceneRetrieval`.
 
@@ -210,7 +212,6 @@ def retrieve_scene(
     check_kind("survey", survey, Survey, "a Survey, as in Survey(lidar, position=...)")
     check_kinds(survey.lidar, scene)
     check_key(key)
-    check_progress(progress)
     check_kind("path", path, str | os.PathLike | None, "a path, or None")
     check_kind("kernels", kernels, Mapping | None, "a mapping from names of unknowns to indices, or None")
     check_number("held_out", held_out, 0.0, 1.0, high_open=True)
@@ -598,7 +599,7 @@ def _fit(
     max_steps: int,
     random: np.random.Generator,
     store: _StoredSteps,
-    progress: Callable[[SceneStep], None] | None,
+    progress: ProgressOption,
 ) -> _FitEnd:
     """Minimise the objective until the held-out misfit no longer falls.
 
@@ -646,7 +647,7 @@ def _fit(
         add_step(latest.x, (latest.misfit, latest.held_out_misfit, latest.objective))
         stopped = no_longer_falls(criterion())
         store.write(len(history) - 1, x=last_x, misfits=history[-1], at_minimum=False)
-        if progress is not None:
+        if callable(progress):
             progress(SceneStep("fit", len(history), latest.misfit, latest.held_out_misfit))
         # SciPy ends the minimisation at this exception, and returns its result as usual.
         if stopped:
@@ -704,7 +705,7 @@ def _draws_of_error(
     draws: int,
     key: PRNGKeyArray,
     store: _StoredSteps,
-    progress: Callable[[SceneStep], None] | None,
+    progress: ProgressOption,
 ) -> Float[np.ndarray, "draws n"]:
     """Draw errors of the values from the linearised posterior."""
     errors = np.zeros((draws, end.x.size))
@@ -723,7 +724,7 @@ def _draws_of_error(
         right_side = of_data + problem.priors.pull_back(end.x, of_priors) + of_bounds
         errors[number] = problem.solve(end, right_side)
         store.write(number, error=errors[number])
-        if progress is not None:
+        if callable(progress):
             progress(SceneStep("errors", number + 1, end.misfit, end.held_out_misfit))
     return errors
 
@@ -733,7 +734,7 @@ def _averaging_kernels(
     end: _FitEnd,
     places: Mapping[str, np.ndarray],
     store: _StoredSteps,
-    progress: Callable[[SceneStep], None] | None,
+    progress: ProgressOption,
 ) -> dict[str, Float[np.ndarray, "places ..."]]:
     """Return rows of the averaging kernel, d estimate / d truth, within the unknown itself.
 
@@ -762,7 +763,7 @@ def _averaging_kernels(
                 row = stored["row"]
             number += 1
             rows.append(row[start : start + u.start.size].reshape(u.start.shape))
-            if stored is None and progress is not None:
+            if stored is None and callable(progress):
                 progress(SceneStep("averaging kernels", number, end.misfit, end.held_out_misfit))
         kernels[u.name] = np.stack(rows)
     return kernels

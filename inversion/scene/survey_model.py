@@ -37,7 +37,7 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray
 from inversion.fit.model import check_position
 from inversion.fit.unknowns import BoundUnknown, Setter, set_values
 from jaxlidar import Lidar, Plan, Scene, Survey, make_setup
-from jaxlidar.extend import ONE_CORE, side_by_side
+from jaxlidar.extend import Program, side_by_side
 from jaxlidar.spectral.apply_optics import make_waveform_model, total_samples
 from jaxlidar.survey.per_shot import ShotGeometry, aim_shot, shot_geometry
 from jaxlidar.trace.device_scene import build_device_scene
@@ -165,8 +165,8 @@ def _gauss_newton_product(
 
 
 # Threads run chunks side by side; a program that took all cores would wait for the others.
-_compiled_pull_back = eqx.filter_jit(_pull_back, **ONE_CORE)
-_compiled_product = eqx.filter_jit(_gauss_newton_product, **ONE_CORE)
+_compiled_pull_back = Program(_pull_back, one_core=True)
+_compiled_product = Program(_gauss_newton_product, one_core=True)
 
 
 class ShotGroups(NamedTuple):

@@ -1,8 +1,8 @@
 """Compiled programs, a bounded number of them: the least recently used are dropped, and their memory freed.
 
 JAX keeps every program that it has compiled. A simulation of many scenes of different sizes would fill the
-memory with programs that are not used again. A `Program` keeps a bounded number of *versions* instead, one
-for each structure, shapes and types of the arguments and each relevant setting of JAX.
+memory with programs that are not used again. A `Program` has *versions* instead, one for each structure,
+shapes and types of the arguments and each relevant setting of JAX. One cache has those of all programs.
 
 Arguments are pytrees. Flattened, an argument is a *static part* (its structure, and the leaves that are not
 arrays), on which the version depends, and its arrays, which are passed to the compiled function.
@@ -19,29 +19,42 @@ import jax
 import numpy as np
 
 from jaxlidar._fields.checks import is_traced
+from jaxlidar._jax.threads import ONE_CORE
 
-# A compiled simulation takes 50 to 250 MB.
-MAX_VERSIONS = 16
+# A simulation has some six programs, which take 50 to 250 MB together.
+MAX_VERSIONS = 96
+# Versions by program and key, those that were used last at the end.
+_versions: "OrderedDict[tuple[Program, Any], _Version]" = OrderedDict()
+_lock = threading.Lock()
 
 
 class Program:
     """A function of pytrees, compiled once for each structure, shape and type of its arguments.
 
-    As with `equinox.filter_jit`, arrays (NumPy's among them) are traced and all else is static. At most
-    `max_versions` compiled versions are kept. Within a JAX transformation the function is called directly.
+    As with `equinox.filter_jit`, arrays (NumPy's among them) are traced and all else is static. Within a JAX
+    transformation the function is called directly.
 
     **Arguments:**
 
     - `function`: the function to compile; all its static arguments are hashable.
-    - `max_versions`: number of versions to keep. Default 16.
-    - `options`: keyword arguments of `jax.jit`.
+    - `one_core`: True for programs that run side by side, each on one core (`side_by_side`). Default False.
     """
 
-    def __init__(self, function: Callable, *, max_versions: int = MAX_VERSIONS, **options: Any):
+    def __init__(self, function: Callable, *, one_core: bool = False):
         functools.update_wrapper(self, function)
-        self.function, self.max_versions, self.options = function, max_versions, options
-        self.versions: OrderedDict[Any, _Version] = OrderedDict()
-        self._lock = threading.Lock()
+        self.function, self.one_core = function, one_core
+
+    @property
+    def versions(self) -> "list[_Version]":
+        """The compiled versions that are kept of this program, those that were used last at the end."""
+        return [version for (program, _), version in _versions.items() if program is self]
+
+    def clear(self) -> None:
+        """Drop all versions of this program."""
+        with _lock:
+            for program, key in [*_versions]:
+                if program is self:
+                    del _versions[program, key]
 
     def __call__(self, *args: Any, **kwargs: Any) -> Any:
         return self._run(_flatten_arguments(args, kwargs))
@@ -90,15 +103,15 @@ class Program:
         settings = (config.jax_enable_x64, config.jax_default_device, config.jax_numpy_rank_promotion)
         static_parts = {name: argument.static for name, argument in arguments.items()}
         types = tuple(argument.types for argument in arguments.values())
-        key = (tuple(static_parts.items()), types, settings)
-        with self._lock:
-            version = self.versions.get(key)
+        key = self, (tuple(static_parts.items()), types, settings)
+        with _lock:
+            version = _versions.get(key)
             if version is None:
-                version = _Version(self.function, static_parts, self.options)
-                self.versions[key] = version
-            self.versions.move_to_end(key)
-            while len(self.versions) > self.max_versions:
-                self.versions.popitem(last=False)
+                version = _Version(self.function, static_parts, ONE_CORE if self.one_core else {})
+                _versions[key] = version
+            _versions.move_to_end(key)
+            while len(_versions) > MAX_VERSIONS:
+                _versions.popitem(last=False)
         return version
 
 
@@ -123,9 +136,14 @@ _ARRAY = object()
 def _flatten(tree: Any) -> _FlatArgument:
     leaves, structure = jax.tree.flatten(tree)
     arrays = [x for x in leaves if _is_array_or_shape(x)]
-    types = tuple((a.shape, a.dtype, getattr(a, "weak_type", False)) for a in arrays)
+    types = tuple((a.shape, _type_of(a), getattr(a, "weak_type", False)) for a in arrays)
     static_leaves = tuple(_ARRAY if _is_array_or_shape(x) else x for x in leaves)
     return _FlatArgument(_StaticPart(structure, static_leaves), types, arrays)
+
+
+def _type_of(array: Any) -> Any:
+    """Return the type that an array has in a program: JAX converts those of NumPy to its precision."""
+    return array.dtype if isinstance(array, jax.Array) else jax.dtypes.canonicalize_dtype(array.dtype)
 
 
 def _unflatten(static: _StaticPart, arrays: Iterator[Any]) -> Any:

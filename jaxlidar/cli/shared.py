@@ -1,15 +1,12 @@
 """Arguments, options, figures and progress bars that several commands have."""
 
-import contextlib
-import math
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import click
 
-from jaxlidar._progress import Progress
 from jaxlidar.io import atomic_write
 from jaxlidar.io.store import is_zarr
 
@@ -52,54 +49,6 @@ def save_figure(axes: Any, path: Path) -> None:
     click.echo(f"figure: {path}")
 
 
-@contextlib.contextmanager
-def simulation_progress_bar(quiet: bool) -> Iterator[Callable[[Progress], None]]:
-    """Show a progress bar for `simulate` on the standard error, if that is a terminal.
-
-    **Returns:** a context with the function to pass as `progress=`.
-    """
-    from tqdm import tqdm
-
-    bar = tqdm(
-        total=100,
-        unit="%",
-        # None: disabled unless the file is a terminal.
-        disable=True if quiet else None,
-        file=sys.stderr,
-        leave=False,
-        bar_format="{desc} {bar} {percentage:3.0f} % {elapsed}",
-        desc="simulating",
-    )
-
-    def show(progress: Progress) -> None:
-        # The error falls with the square root of the number of photons, so the fraction of the work that is
-        # completed is the squared ratio of the target to the current error.
-        completed = 0.0
-        error = math.inf if progress.error is None else progress.error
-        if progress.rtol is not None and math.isfinite(error):
-            completed = (progress.rtol / max(error, 1e-9)) ** 2
-        bar.set_description(f"{progress.done:,} photons, error {error:.2g}", refresh=False)
-        bar.n = round(100 * min(completed, 1.0))
-        bar.refresh()
-
-    with bar:
-        yield show
-
-
-@contextlib.contextmanager
-def survey_progress_bar(quiet: bool, shots: int) -> Iterator[Callable[[Progress], None]]:
-    """Show a progress bar for `simulate_many` on the standard error, if that is a terminal.
-
-    **Returns:** a context with the function to pass as `progress=`.
-    """
-    from tqdm import tqdm
-
-    disable = True if quiet else None
-    bar = tqdm(total=shots, unit=" shots", disable=disable, file=sys.stderr, leave=False, desc="simulating")
-
-    def show(progress: Progress) -> None:
-        bar.n = progress.done
-        bar.refresh()
-
-    with bar:
-        yield show
+def shows_bar(quiet: bool) -> bool:
+    """Return True if a command shows progress: on the standard error, if that is a terminal."""
+    return not quiet and sys.stderr.isatty()

@@ -14,8 +14,7 @@ from jaxlidar.cli.shared import (
     new_axes,
     out_option,
     save_figure,
-    simulation_progress_bar,
-    survey_progress_bar,
+    shows_bar,
 )
 from jaxlidar.io import Case, read_case
 from jaxlidar.io.netcdf import open as open_result
@@ -67,8 +66,7 @@ def simulate(
     complete_case = read_complete_case(case, seed, rtol)
     if complete_case.survey is not None:
         return _simulate_survey(complete_case, out, plot, quiet)
-    with simulation_progress_bar(quiet) as show:
-        wave = complete_case.simulate(show)
+    wave = complete_case.simulate(shows_bar(quiet))
     click.echo(str(wave))
     if out is not None:
         wave.save(out, complete_case)
@@ -86,8 +84,7 @@ def _simulate_survey(case: Case, out: Path | None, plot: Path | None, quiet: boo
     assert case.survey is not None
     store = out if out is None or is_zarr(out) else store_beside(out)
     try:
-        with survey_progress_bar(quiet, len(case.survey)) as show:
-            waveforms = case.simulate(show, store)
+        waveforms = case.simulate(shows_bar(quiet), store)
     except KeyboardInterrupt:
         if out is None:
             message = "finished shots are lost: give -o to keep them"

@@ -40,6 +40,7 @@ from jaxlidar.io.toml import (
     value_of,
     with_references,
 )
+from jaxlidar.progress import ProgressOption
 from jaxlidar.scenes.scene import Scene
 from jaxlidar.sensors.lidar import Lidar
 from jaxlidar.sensors.survey import Survey
@@ -102,9 +103,7 @@ class Case:
     def __setstate__(self, state: dict[str, Any]) -> None:
         vars(self).update(state, key=None if state["key"] is None else _key_of(state["key"]))
 
-    def simulate(
-        self, progress: Callable[[Any], None] | None = None, path: str | os.PathLike[str] | None = None
-    ) -> Any:
+    def simulate(self, progress: ProgressOption = None, path: str | os.PathLike[str] | None = None) -> Any:
         """Simulate the waveform of this case, or those of its survey.
 
         **Arguments:**

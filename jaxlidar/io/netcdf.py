@@ -4,7 +4,7 @@ import contextlib
 import datetime
 import json
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +27,7 @@ from jaxlidar.io.datasets import (
 from jaxlidar.io.files import atomic_write
 from jaxlidar.io.groups import StoredGroups, is_result_file, open_groups, write_groups
 from jaxlidar.io.store import replacing
+from jaxlidar.progress import ProgressOption
 from jaxlidar.sensors.photon_counter import PhotonEvents
 from jaxlidar.simulation.truth import Truth
 from jaxlidar.spectral.waveform import Waveform
@@ -213,7 +214,7 @@ def read_case(path: str | os.PathLike[str]) -> Case:
         return case_of_group(file, "case")
 
 
-def rerun(path: str | os.PathLike[str], progress: Callable[[Any], None] | None = None) -> Any:
+def rerun(path: str | os.PathLike[str], progress: ProgressOption = None) -> Any:
     """Simulate again the waveform of a file that was saved with its case, or the waveforms of a survey.
 
     On the same machine, with the same versions (the attribute `versions`), the waveform is the same bit for

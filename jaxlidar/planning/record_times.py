@@ -84,8 +84,8 @@ def bins_and_samples(
     # take the B-spline and rounding.
     edge = begin - 0.5 * interval
     if window is None:
-        # The earliest first return for which samples begin here: whatever it is, the first bin lies equally far
-        # from the first sample, so that programs are the same.
+        # The earliest first return for which samples begin here: whatever it is, the first bin lies equally
+        # far from the first sample, so that programs are the same.
         first = min(first, begin - pulse_start)
     lead = math.ceil((edge - first) / width) + 3
     count = lead + math.ceil((last - edge) / width) + 3

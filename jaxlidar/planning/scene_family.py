@@ -43,7 +43,7 @@ def union_plan(
     bins = dataclasses.replace(
         first.bins,
         start=start,
-        count=round((end - start) / first.bins.width),
+        count=size_bucket(round((end - start) / first.bins.width), 4),
         max_span=max(p.bins.max_span for p in plans),
     )
     start_distance = max(p.limits.start_distance for p in plans)

@@ -23,7 +23,7 @@ neighbouring voxels is uncertain: a voxel that the side of a trunk cuts through 
 volume with 8 samples (root mean square, measured).
 """
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -41,6 +41,7 @@ from jaxlidar._fields.checks import (
 from jaxlidar.plants.grid import Grid, voxel_edges
 from jaxlidar.plants.stand import Stand
 from jaxlidar.plants.tree import Tree
+from jaxlidar.progress import ProgressOption, shows_progress
 from jaxlidar.scenes.voxels import VoxelMap
 
 # In radians.
@@ -58,6 +59,7 @@ _OFFSETS, _AZIMUTHS = 4, 16
 _FACE_TOLERANCE = 1e-7
 
 
+@shows_progress
 def voxelise(
     trees: Tree | Iterable[Tree],
     voxel_size: float | tuple[float, float, float],
@@ -67,7 +69,7 @@ def voxelise(
     samples: int = 8,
     origin: tuple[float, float, float] | None = None,
     shape: tuple[int, int, int] | None = None,
-    progress: Callable[[int, int], None] | None = None,
+    progress: ProgressOption = None,
 ) -> VoxelMap:
     """Voxelise leaf and bark of one tree, or of several trees together.
 
@@ -95,8 +97,8 @@ def voxelise(
     - `origin`, `shape`: lower corner (x, y, z) in m and numbers of voxels (nx, ny, nz) of the grid; give both
       or neither. Default None: the smallest grid that holds all trees, with faces at multiples of the edge,
       so that the maps of neighbouring trees fit together.
-    - `progress`: of a stand: a function called with the numbers of trees that are done, and of all, after
-      each. Default None.
+    - `progress`: of a stand: True for a bar; or a function called with the numbers of trees that are done,
+      and of all, after each. Default None: silent.
 
     **Returns:** a `VoxelMap`.
 
@@ -186,7 +188,7 @@ def _voxelise_stand(
     samples: int,
     origin: tuple[float, float, float] | None,
     shape: tuple[int, int, int] | None,
-    progress: Callable[[int, int], None] | None,
+    progress: ProgressOption,
 ) -> VoxelMap:
     """Voxelise a stand by its individuals; arguments as those of `voxelise`.
 
@@ -236,9 +238,9 @@ def _voxelise_stand(
                 if factor > 0.0 and table[-1, -1, -1] > 0.0:
                     total[target] += factor * _box_sums(table, [t for _, t in faces])
             n_copies += 1
-            if progress is not None:
+            if callable(progress):
                 progress(n_copies, len(stand))
-    if progress is not None and n_copies < len(stand):
+    if callable(progress) and n_copies < len(stand):
         # Copies without material took no time.
         progress(len(stand), len(stand))
     return _voxel_map(grid, sums, (has_wood, has_leaf), None if leaf_area is None else 1.0, wood)

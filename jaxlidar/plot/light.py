@@ -7,7 +7,6 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.ticker import EngFormatter, LogLocator, NullFormatter, PercentFormatter
 
-from jaxlidar._progress import Progress
 from jaxlidar.plot.style import (
     BEAM_COLOUR,
     MATERIAL_COLOURS,
@@ -17,6 +16,7 @@ from jaxlidar.plot.style import (
     check_waveform,
     make_axes,
 )
+from jaxlidar.progress import Progress
 from jaxlidar.spectral.waveform import Waveform
 
 # Colour and hatch of the entries of an energy budget other than absorption by a material.

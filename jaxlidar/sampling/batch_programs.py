@@ -15,7 +15,6 @@ from jaxtyping import Array, Float, PRNGKeyArray, UInt32
 
 from jaxlidar._fields.checks import is_traced
 from jaxlidar._jax.programs import Program
-from jaxlidar._jax.threads import ONE_CORE
 from jaxlidar.planning.setup import Setup
 from jaxlidar.spectral.apply_optics import (
     WaveformModel,
@@ -82,10 +81,10 @@ def _with_batch_number(trace: Callable) -> Callable:
 
 
 _compiled_trace = Program(trace_device_scene)
-_compiled_batch = Program(_with_batch_number(trace_device_scene), **ONE_CORE)
-_compiled_first = Program(_with_batch_number(trace_first), **ONE_CORE)
-_compiled_higher = Program(_with_batch_number(trace_higher), **ONE_CORE)
-_compiled_estimate = Program(_estimate, **ONE_CORE)
+_compiled_batch = Program(_with_batch_number(trace_device_scene), one_core=True)
+_compiled_first = Program(_with_batch_number(trace_first), one_core=True)
+_compiled_higher = Program(_with_batch_number(trace_higher), one_core=True)
+_compiled_estimate = Program(_estimate, one_core=True)
 _compiled_sum = Program(_add)
 _compiled_waveform = Program(_mean_waveform)
 

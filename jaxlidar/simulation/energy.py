@@ -13,13 +13,13 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from jaxlidar._fields.checks import check_choice, check_integer, check_key, check_range, concrete_number
 from jaxlidar._jax.programs import Program
-from jaxlidar._jax.threads import ONE_CORE, side_by_side
-from jaxlidar._progress import Progress
+from jaxlidar._jax.threads import side_by_side
 from jaxlidar.planning.path_lengths import PathLengths
 from jaxlidar.planning.plan import MIN_BATCHES
 from jaxlidar.planning.plan import plan as make_plan
 from jaxlidar.planning.setup import Setup, make_setup
 from jaxlidar.planning.size_buckets import size_bucket
+from jaxlidar.progress import Progress, ProgressOption, shows_progress
 from jaxlidar.sampling.adaptive import (
     BATCH_STEPS,
     AbstractEstimate,
@@ -79,6 +79,7 @@ class EnergyBudget(eqx.Module):
     info: dict = eqx.field(static=True)
 
 
+@shows_progress
 def energy_budget(
     lidar: Lidar,
     scene: Scene,
@@ -88,7 +89,7 @@ def energy_budget(
     illumination: str = "beam",
     max_orders: int = 10_000,
     max_photons: int = 100_000_000,
-    progress: Callable[[Progress], None] | None = None,
+    progress: ProgressOption = None,
 ) -> EnergyBudget:
     """Compute the energy that a scene absorbs, returns to the sky and transmits to the ground.
 
@@ -106,7 +107,8 @@ def energy_budget(
       canopy with periodic sides.
     - `max_orders`: scatterings followed, at least 1; light that remains then is `unfollowed`. Default 10,000.
     - `max_photons`: stop after this number of photons, at least 1, whatever the error. Default 100,000,000.
-    - `progress`: a function called with a `Progress` after every round; for instance `print`. Default None.
+    - `progress`: True for a bar with the error and the time left; or a function called with a `Progress`
+      after every round. Default None: silent.
 
     An interrupt (Ctrl-C) after eight batches ends it with the batches that are done.
 
@@ -149,7 +151,7 @@ def energy_budget(
         estimate = _BudgetEstimate(lambda numbers: run(trace_batch, numbers))
 
         def report(errors: HasErrors) -> None:
-            if progress is not None:
+            if callable(progress):
                 photons = estimate.n_batches * PHOTONS_PER_BATCH
                 seconds = time.perf_counter() - start_time
                 progress(Progress(photons, None, seconds, "photons", error=errors.relative, rtol=rtol))
@@ -258,4 +260,4 @@ def _trace(
     )
 
 
-_compiled_trace = Program(_trace, **ONE_CORE)
+_compiled_trace = Program(_trace, one_core=True)

@@ -15,7 +15,7 @@ from jaxtyping import Array, Int, PRNGKeyArray
 
 from jaxlidar._fields.checks import check_integer, check_key, check_kind, is_traced
 from jaxlidar._jax.programs import Program
-from jaxlidar._jax.threads import ONE_CORE, side_by_side
+from jaxlidar._jax.threads import side_by_side
 from jaxlidar.planning.memory import memory_limit, transformed_bytes
 from jaxlidar.planning.plan import Plan
 from jaxlidar.planning.plan_check import check_plan
@@ -140,7 +140,7 @@ def _refuse_uncovered(lidar: Lidar, scenes: Scene, plan: Plan, numbers: np.ndarr
 
 
 # One core each: chunks run side by side on threads.
-_compiled_chunk = Program(_simulate_chunk, **ONE_CORE)
+_compiled_chunk = Program(_simulate_chunk, one_core=True)
 
 
 def _simulate_in_chunks(

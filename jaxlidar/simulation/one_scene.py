@@ -24,7 +24,6 @@ from jaxlidar._fields.checks import (
 )
 from jaxlidar._jax.mesh_axes import vary_with, with_automatic_axes
 from jaxlidar._jax.threads import side_by_side
-from jaxlidar._progress import Progress
 from jaxlidar._summary import NOTABLE_FRACTION, outside_fraction, percent, unfollowed_message
 from jaxlidar.planning.memory import MAX_APPLIED_WAVELENGTHS
 from jaxlidar.planning.orders import MAX_ORDERS, orders_to_tolerance
@@ -32,6 +31,7 @@ from jaxlidar.planning.plan import MIN_BATCHES, Plan
 from jaxlidar.planning.plan import plan as make_plan
 from jaxlidar.planning.plan_check import check_plan
 from jaxlidar.planning.setup import make_setup
+from jaxlidar.progress import Progress, ProgressOption, shows_progress
 from jaxlidar.sampling.adaptive import (
     BATCH_STEPS,
     AbstractEstimate,
@@ -56,6 +56,7 @@ from jaxlidar.trace.response import Response, trace_device_scene
 MAX_BATCH_PHOTONS = 65_536
 
 
+@shows_progress
 @with_automatic_axes
 def simulate(
     lidar: Lidar,
@@ -76,7 +77,7 @@ def simulate(
     max_memory: float | None = None,
     max_seconds: float = math.inf,
     truth: bool = False,
-    progress: Callable[[Progress], None] | None = None,
+    progress: ProgressOption = None,
 ) -> Waveform:
     """Simulate the waveform that `lidar` records of `scene`.
 
@@ -111,8 +112,8 @@ def simulate(
       positive. At least eight batches are traced. Default inf.
     - `truth`: True to add `Waveform.truth`: reference quantities computed from the scene itself (gap
       probability, area densities, heights), to train or to test retrieval algorithms. Default False.
-    - `progress`: a function called with a `Progress` after every round of batches; for instance `print`.
-      Default None.
+    - `progress`: True for a bar with the error and the time left; or a function called with a `Progress`
+      after every round of batches. Default None: silent.
 
     **Returns:** a `Waveform`. Its `info` says how many photons were traced and why the simulation stopped.
 
@@ -267,7 +268,7 @@ def _run_batches(
     tracer: BatchTracer,
     key: PRNGKeyArray,
     goal: _Goal,
-    progress: Callable[[Progress], None] | None,
+    progress: ProgressOption,
     start_time: float,
 ) -> _BatchResults:
     """Trace once if nothing is random, a fixed number of batches if transformed, or until the goal."""
@@ -430,7 +431,7 @@ def _trace_batches(
     tracer: BatchTracer,
     key: PRNGKeyArray,
     goal: _Goal,
-    progress: Callable[[Progress], None] | None,
+    progress: ProgressOption,
     start_time: float,
 ) -> _BatchResults:
     """Trace batches on all cores, round after round, until the goal is reached.
@@ -452,7 +453,7 @@ def _trace_batches(
         estimate = _WaveformEstimate(tracer, lambda numbers: run(trace_batch, numbers))
 
         def report(errors: HasErrors) -> None:
-            if progress is not None:
+            if callable(progress):
                 photons = estimate.n_batches * plan.photons_traced
                 seconds = time.perf_counter() - start_time
                 progress(Progress(photons, None, seconds, "photons", error=errors.relative, rtol=stop.rtol))

@@ -48,7 +48,7 @@ from jaxlidar._fields.checks import (
 )
 from jaxlidar._jax.products import matmul
 from jaxlidar._jax.programs import Program
-from jaxlidar._jax.threads import ONE_CORE, side_by_side
+from jaxlidar._jax.threads import side_by_side
 from jaxlidar._vectors import Vec, vec
 from jaxlidar.planning.path_lengths import PathLengths
 from jaxlidar.planning.plan import MIN_BATCHES, Plan
@@ -468,4 +468,4 @@ def _trace_batch(
 
 
 # One core each: batches run side by side on threads.
-_compiled_batch = Program(_trace_batch, **ONE_CORE)
+_compiled_batch = Program(_trace_batch, one_core=True)

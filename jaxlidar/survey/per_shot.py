@@ -38,7 +38,6 @@ import numpy as np
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from jaxlidar._jax.programs import Program
-from jaxlidar._jax.threads import ONE_CORE
 from jaxlidar._jax.workers import WorkUnit, task
 from jaxlidar.planning.plan import MIN_BATCHES
 from jaxlidar.planning.setup import Setup
@@ -618,4 +617,4 @@ def map_first_shots(function: Callable[[ShotGeometry], Any], shots: ShotGeometry
     return jax.lax.fori_loop(0, count, add, empty)
 
 
-compiled_shots = Program(_trace_shots, **ONE_CORE)
+compiled_shots = Program(_trace_shots, one_core=True)

@@ -61,9 +61,9 @@ from jaxlidar._fields.checks import (
     warn_user,
 )
 from jaxlidar._not_kept import NotKept
-from jaxlidar._progress import Progress
 from jaxlidar.io.airborne import AirborneShot, Returns, Segment
 from jaxlidar.io.las import write_las
+from jaxlidar.progress import Progress, ProgressOption
 from jaxlidar.sensors.lidar import Lidar
 from jaxlidar.sensors.survey import Survey, beam_directions
 from jaxlidar.survey.acquisition import PULSE_OVERSAMPLING, Acquisition, acquisition_of
@@ -804,7 +804,7 @@ def returns_of(
     threshold: Any = None,
     fraction: Any = 0.5,
     max_returns: int | None = None,
-    progress: Callable[[Progress], None] | None = None,
+    progress: ProgressOption = None,
 ) -> DiscreteReturns:
     """Detect the returns of waveforms. Arguments are those of `Waveforms.returns`."""
     if not callable(detector):
@@ -814,7 +814,6 @@ def returns_of(
             "threshold is given, but detector is a function; admissible is a function that applies its own"
         )
     check_number("fraction", fraction, 0.0, 1.0, low_open=True, high_open=True)
-    check_kind("progress", progress, Callable | None, "a function, or None")
     if max_returns is not None:
         max_returns = check_integer("max_returns", max_returns)
     shape, is_own_record = waves.recorded.shape, record is None
@@ -833,7 +832,7 @@ def returns_of(
                 blocks.append(block)
         else:
             blocks.append(_detect_chunk(waves, records[shots], shots, settings))
-        if progress is not None:
+        if callable(progress):
             progress(Progress(shots.stop, len(waves), time.perf_counter() - start_time))
     echoes = {name: np.concatenate([block[name] for block in blocks]) for name in blocks[0]}
     return _assemble(waves, echoes, max_returns)

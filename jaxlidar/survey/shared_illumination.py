@@ -46,7 +46,6 @@ from scipy import sparse
 
 from jaxlidar._fields.checks import as_array
 from jaxlidar._jax.programs import Program
-from jaxlidar._jax.threads import ONE_CORE
 from jaxlidar._jax.workers import WorkUnit, task
 from jaxlidar.planning.plan import MIN_BATCHES
 from jaxlidar.planning.setup import Setup
@@ -310,7 +309,7 @@ def _group_moments(
     return moments._replace(mean_only=components)
 
 
-compiled_group_moments = Program(_group_moments, **ONE_CORE)
+compiled_group_moments = Program(_group_moments, one_core=True)
 
 
 def _group_scene(scene: DeviceScene, model: WaveformModel, light: GroupLight) -> DeviceScene:
@@ -335,7 +334,7 @@ def _first_order_samples(
     return jax.vmap(lambda w: response_samples(jnp.sum(w, axis=1), model.first_histories, model))(weights)
 
 
-_compiled_first_order_samples = Program(_first_order_samples, **ONE_CORE)
+_compiled_first_order_samples = Program(_first_order_samples, one_core=True)
 
 
 class ErrorTarget(NamedTuple):

@@ -31,10 +31,10 @@ from jaxlidar._fields.checks import (
 )
 from jaxlidar._fingerprint import fingerprint
 from jaxlidar._jax.workers import WorkUnit, outcomes
-from jaxlidar._progress import Progress
 from jaxlidar._registry import simulate_survey
 from jaxlidar.io.case import Case, case_text
 from jaxlidar.io.store import check_store_path, open_store
+from jaxlidar.progress import Progress, ProgressOption, shows_progress
 from jaxlidar.scenes.scene import Scene, check_kinds
 from jaxlidar.scenes.scene_parts import SceneParts
 from jaxlidar.sensors.survey import Survey
@@ -49,6 +49,7 @@ from jaxlidar.survey.waveforms import Waveforms
 
 
 @simulate_survey.register
+@shows_progress
 def simulate_many(
     survey: Survey,
     scene: Scene | SceneParts,
@@ -59,7 +60,7 @@ def simulate_many(
     path: str | os.PathLike[str] | None = None,
     executor: Executor | None = None,
     mesh: jax.sharding.Mesh | None = None,
-    progress: Callable[[Progress], None] | None = None,
+    progress: ProgressOption = None,
     shared: bool | None = None,
     truth: bool = False,
     keep: Collection[str] | None = None,
@@ -108,8 +109,8 @@ def simulate_many(
       worker dies gets a second try. Default None: this process, on all cores.
     - `mesh`: a `jax.sharding.Mesh`, whose devices do tasks: each takes the next one. A program is compiled
       for each device. Default None: the default device.
-    - `progress`: a function called with a `Progress` after every task; for instance `print`. Default
-      None.
+    - `progress`: True for a bar with the time left; or a function called with a `Progress` after every task.
+      Default None: silent.
     - `shared`: True traces with shared illumination, and refuses shots that cannot share light; False traces
       per shot. Default None: shared where it is possible and saves time.
     - `truth`: True adds `Waveforms.truth`: reference quantities computed from the scene itself (gap
@@ -151,7 +152,6 @@ def simulate_many(
     check_kind("executor", executor, Executor | None, "a concurrent.futures.Executor, or None")
     check_kind("mesh", mesh, jax.sharding.Mesh | None, "a jax.sharding.Mesh, or None")
     devices = None if mesh is None else _devices(mesh, executor)
-    check_kind("progress", progress, Callable | None, "a function, or None")
     check_kind("shared", shared, bool | None, "True, False or None")
     check_flag("truth", truth)
     kept_names = _kept_names(keep)
@@ -276,7 +276,7 @@ def _trace(
     results: SurveyResults,
     key: PRNGKeyArray,
     run_tasks: Callable[[list[WorkUnit]], Iterator[tuple[WorkUnit, Any]]],
-    progress: Callable[[Progress], None] | None,
+    progress: ProgressOption,
 ) -> None:
     """Run the tasks without a result yet, until the results of all shots are there."""
     tasks, shots = results.strategy.tasks(key), len(results.strategy.survey)
@@ -287,7 +287,7 @@ def _trace(
     for unit, result in run_tasks(missing_tasks):
         results.add(unit.number, result)
         n_done += 1
-        if progress is not None:
+        if callable(progress):
             seconds = time.perf_counter() - start_time
             progress(Progress(shots * n_done // len(tasks), shots, seconds, stored=stored))
     results.sum_contributions()

@@ -8,7 +8,6 @@ import numpy as np
 from jaxtyping import Array, PRNGKeyArray
 
 from jaxlidar._jax.programs import Program
-from jaxlidar._jax.threads import ONE_CORE
 from jaxlidar._jax.workers import WorkUnit, task
 from jaxlidar.scenes.atmosphere import Atmosphere
 from jaxlidar.simulation.truth import compute_labels, first_order_setup
@@ -133,4 +132,4 @@ def _truths_of_shots(
     return map_first_shots(truth_of_shot, shots, count)
 
 
-_compiled_truths = Program(_truths_of_shots, **ONE_CORE)
+_compiled_truths = Program(_truths_of_shots, one_core=True)

@@ -1,7 +1,6 @@
 """The waveforms of all shots of a survey."""
 
 import os
-from collections.abc import Callable
 from typing import Any, final
 
 import equinox as eqx
@@ -12,7 +11,6 @@ from jaxtyping import ArrayLike, Float, Int
 from jaxlidar._constants import SPEED_OF_LIGHT
 from jaxlidar._fields.checks import check_index, check_numbers
 from jaxlidar._not_kept import NotKept
-from jaxlidar._progress import Progress
 from jaxlidar._registry import detect_returns, true_returns
 from jaxlidar._summary import NOTABLE_FRACTION, percent
 from jaxlidar.io import netcdf
@@ -20,6 +18,7 @@ from jaxlidar.io.case import Case
 from jaxlidar.io.datasets import datasets_of, keep_as_netcdf
 from jaxlidar.io.las_waveforms import write_las_waveforms
 from jaxlidar.io.netcdf import WAVEFORM_QUANTITIES
+from jaxlidar.progress import ProgressOption, shows_progress
 from jaxlidar.sampling.adaptive import StopReason
 from jaxlidar.sensors.lidar import Lidar
 from jaxlidar.sensors.survey import beam_directions
@@ -208,6 +207,7 @@ class Waveforms(eqx.Module):
             return f"orders beyond {self.info['orders']} may add {percent(neglected)}"
         return StopReason.TOLERANCE_MET.value
 
+    @shows_progress
     def returns(
         self,
         detector: str | DetectorFunction = "peak",
@@ -219,7 +219,7 @@ class Waveforms(eqx.Module):
         threshold: ArrayLike | None = None,
         fraction: ArrayLike = 0.5,
         max_returns: int | None = None,
-        progress: Callable[[Progress], None] | None = None,
+        progress: ProgressOption = None,
     ) -> DiscreteReturns:
         """Detect the discrete returns of all shots, as a laser scanner reports them.
 
@@ -250,7 +250,8 @@ class Waveforms(eqx.Module):
         - `fraction`: level of "constant fraction" on the leading edge, over the amplitude, in (0, 1).
           Default 0.5.
         - `max_returns`: the strongest returns of a shot that has more. Default None: all.
-        - `progress`: a function called with a `Progress` after every few thousand shots. Default None.
+        - `progress`: True for a bar; or a function called with a `Progress` after every few thousand shots.
+          Default None: silent.
 
         **Returns:** a `DiscreteReturns`.
 

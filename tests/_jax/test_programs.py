@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from jaxlidar._jax import programs
 from jaxlidar._jax.programs import Program
 
 
@@ -50,9 +51,10 @@ def test_one_program_for_each_structure_shape_and_type():
     assert function.n_traces == 7
 
 
-def test_the_least_recently_used_programs_are_dropped():
+def test_the_least_recently_used_programs_are_dropped(monkeypatch):
+    monkeypatch.setattr(programs, "MAX_VERSIONS", 3)
     function = CountedFunction()
-    program = Program(function, max_versions=3)
+    program = Program(function)
     for n in (1, 2, 3, 1, 4):
         program(jnp.zeros(n))
     assert (function.n_traces, len(program.versions)) == (4, 3)
@@ -62,11 +64,12 @@ def test_the_least_recently_used_programs_are_dropped():
     assert function.n_traces == 5
 
 
-def test_dropped_programs_are_freed_at_once():
+def test_dropped_programs_are_freed_at_once(monkeypatch):
     """Without a collection of garbage, which comes many programs later."""
-    program = Program(CountedFunction(), max_versions=1)
+    monkeypatch.setattr(programs, "MAX_VERSIONS", 1)
+    program = Program(CountedFunction())
     program(jnp.zeros(1))
-    version = weakref.ref(next(iter(program.versions.values())))
+    version = weakref.ref(program.versions[0])
     gc.disable()
     try:
         program(jnp.zeros(2))

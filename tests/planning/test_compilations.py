@@ -59,7 +59,7 @@ def compiled():
     programs = {name: p for name, p in vars(batch_programs).items() if isinstance(p, Program)}
     del programs["compiled_geometry"]
     for program in programs.values():
-        program.versions.clear()
+        program.clear()
 
     def count():
         return {name: len(program.versions) for name, program in programs.items()}

@@ -65,11 +65,11 @@ def test_a_batch_is_the_trace_of_its_key(orders, transmission, change):
 @pytest.mark.slow
 def test_traces_begin_to_compile_before_the_waveform_model_is_made(monkeypatch):
     """The program that takes longest begins first, in another thread."""
-    batch_programs._compiled_higher.versions.clear()
+    batch_programs._compiled_higher.clear()
     make, compilations = batch_programs.make_padded_waveform_model, []
 
     def make_model(setup):
-        versions = batch_programs._compiled_higher.versions.values()
+        versions = batch_programs._compiled_higher.versions
         compilations.extend(version.compilation for version in versions)
         return make(setup)
 

@@ -1,0 +1,203 @@
+"""A change of a number compiles nothing, in every entry point; a voxel layer or a shot more no long program.
+
+Programs are counted as JAX compiles them, whoever asks for it: those of the package and those of single
+operations. Scenes and surveys are small, photons few: programs are the same.
+"""
+
+import dataclasses
+
+import jax
+import numpy as np
+import pytest
+
+import inversion
+import jaxlidar as jl
+
+KEY = jax.random.key(0)
+# Programs that take less than half a second to compile, for sizes as they are.
+SHORT_PROGRAMS = {"_build_geometry", "_sample_fractions", "stage", "multiply", "_normal_cdf", "_z_score"}
+
+
+@dataclasses.dataclass(frozen=True)
+class Case:
+    """The numbers of a small scene, a lidar and a survey."""
+
+    zenith: float = 5.0
+    azimuth: float = 10.0
+    altitude: float = 500.0
+    position: tuple[float, float] = (0.1, 0.2)
+    divergence: float = 2.0
+    fwhm: float = 5.0
+    wavelength: float = 1064.0
+    height: float = 0.0
+    slope: float = 3.0
+    reflectance: float = 0.3
+    base: float = 2.0
+    leaf_area_density: float = 0.5
+    Cab: float = 40.0
+    window: tuple[float, float] = (-70.0, 40.0)
+    rtol: float = 0.3
+    n_layers: int = 10
+    n_shots: int = 5
+    n_columns: int = 6
+
+    @property
+    def lidar(self):
+        pulse = jl.GaussianPulse(fwhm=self.fwhm)
+        return jl.Lidar(
+            wavelength=self.wavelength,
+            zenith=self.zenith,
+            azimuth=self.azimuth,
+            altitude=self.altitude,
+            position=self.position,
+            divergence=self.divergence,
+            pulse=pulse,
+        )
+
+    @property
+    def scene(self):
+        n = self.n_columns
+        random = np.random.default_rng(0).uniform(size=(n, n, self.n_layers))
+        voxels = jl.VoxelMap.from_lad(
+            self.leaf_area_density * random,
+            voxel_size=(1.0, 1.0, 0.5),
+            origin=(-0.5 * n, -0.5 * n, self.base),
+        )
+        leaf = jl.Prospect(Cab=self.Cab)
+        ground = jl.Ground(height=self.height, slope=self.slope, reflectance=self.reflectance)
+        return jl.Scene(canopy=jl.Canopy(voxels, leaf=leaf, hotspot=False), ground=ground)
+
+    @property
+    def survey(self):
+        random = np.random.default_rng(1)
+        shifts = random.uniform(-1.0, 1.0, (self.n_shots, 2))
+        zenith = self.zenith + random.uniform(-2.0, 2.0, self.n_shots)
+        return jl.Survey(self.lidar, position=np.add(self.position, shifts), zenith=zenith)
+
+
+CHANGES = {
+    "zenith": 5.4,
+    "azimuth": 35.0,
+    "altitude": 510.0,
+    "position": (0.3, -0.1),
+    "divergence": 2.1,
+    "fwhm": 5.1,
+    "wavelength": 1080.0,
+    "height": 0.1,
+    "slope": 3.2,
+    "reflectance": 0.35,
+    "base": 2.1,
+    "leaf_area_density": 0.55,
+    "Cab": 50.0,
+    "window": (-71.0, 39.0),
+    "rtol": 0.28,
+}
+SIZES = {"n_layers": 11, "n_shots": 6, "n_columns": 7}
+
+
+def simulate(case):
+    return jl.simulate(
+        case.lidar, case.scene, key=KEY, rtol=case.rtol, window=case.window, max_orders=3, n_photons=512
+    )
+
+
+def simulate_many(case):
+    return jl.simulate_many(case.survey, case.scene, key=KEY, rtol=case.rtol, max_orders=1)
+
+
+def simulate_many_with_truth(case):
+    return jl.simulate_many(case.survey, case.scene, key=KEY, rtol=case.rtol, max_orders=1, truth=True)
+
+
+def simulate_many_orders(case):
+    return jl.simulate_many(case.survey, case.scene, key=KEY, rtol=case.rtol, max_orders=2)
+
+
+def energy_budget(case):
+    return jl.energy_budget(case.lidar, case.scene, key=KEY, rtol=0.05, max_photons=20_000)
+
+
+def reflectance_factor(case):
+    canopy = dataclasses.replace(case.scene.canopy, sides="periodic")
+    return jl.reflectance_factor(
+        dataclasses.replace(case.scene, canopy=canopy),
+        sun=(30.0, 100.0),
+        view=(case.zenith, case.azimuth),
+        wavelengths=case.wavelength,
+        key=KEY,
+        n_photons=512,
+        max_orders=3,
+    )
+
+
+def truth_of(case):
+    return jl.truth_of(case.lidar, case.scene)
+
+
+def simulate_scenes(case):
+    scenes = jax.tree.map(lambda a: np.stack([a, a]), case.scene)
+    return jl.simulate_scenes(case.lidar, scenes, key=KEY, plan=plan_scenes(case, scenes))
+
+
+def plan_scenes(case, scenes):
+    return jl.plan_scenes(case.lidar, scenes, max_orders=2, n_photons=256, window=case.window)
+
+
+def retrieve(case):
+    wave = simulate(case)
+    unknowns = [inversion.Unknown("canopy.leaf.Cab", bounds=(5.0, case.Cab + 40.0), name="Cab")]
+    problem = inversion.Problem(
+        wave, case.lidar, case.scene, unknowns, noise=0.01, n_photons=512, n_rays=256, max_orders=2
+    )
+    return inversion.retrieve(problem, key=KEY, max_steps=2)
+
+
+ENTRY_POINTS = [
+    simulate,
+    simulate_many,
+    pytest.param(simulate_many_with_truth, marks=pytest.mark.slow),
+    pytest.param(simulate_many_orders, marks=pytest.mark.slow),
+    energy_budget,
+    reflectance_factor,
+    truth_of,
+    pytest.param(simulate_scenes, marks=pytest.mark.slow),
+    retrieve,
+]
+
+
+@pytest.fixture(scope="module")
+def compiled_names():
+    """The names of the programs that JAX has compiled, in the order in which they were."""
+    names = []
+
+    def note(event, duration, fun_name="", **_):
+        if event == "/jax/core/compile/backend_compile_duration":
+            names.append(fun_name.removeprefix("jit(").removesuffix(")"))
+
+    jax.monitoring.register_event_duration_secs_listener(note)
+    yield names
+    jax.monitoring.unregister_event_duration_listener(note)
+
+
+@pytest.mark.parametrize("entry_point", ENTRY_POINTS)
+def test_a_change_of_a_number_compiles_nothing(entry_point, compiled_names):
+    """Each number in turn; then one voxel layer, column or shot more, which compiles short programs alone.
+
+    A program that is compiled for a change is found: the first call compiles some.
+    """
+    compiled_names.clear()
+    for _ in range(2):
+        entry_point(Case())
+    assert len(compiled_names) > 3
+    compiled = {}
+    for name, value in CHANGES.items():
+        compiled_names.clear()
+        entry_point(dataclasses.replace(Case(), **{name: value}))
+        compiled[name] = [*compiled_names]
+    assert {name: {*programs} - SHORT_PROGRAMS for name, programs in compiled.items()} == {
+        name: set() for name in CHANGES
+    }
+    for name, value in SIZES.items():
+        compiled_names.clear()
+        entry_point(dataclasses.replace(Case(), **{name: value}))
+        assert {*compiled_names} <= SHORT_PROGRAMS, name
