@@ -155,7 +155,7 @@ class FittedBatch(NamedTuple):
     `highest_return`: (shots,) m over the reference of the window.
     """
 
-    fits: inversion.Retrievals
+    fits: inversion.Retrieval
     windows: list[FitWindow]
     recorders: list[Recorder]
     highest_return: np.ndarray

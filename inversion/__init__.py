@@ -3,7 +3,7 @@
 ## Fits with a model
 
 `Problem`, `retrieve`, `retrieve_many`, `Unknown`, `LogNormal`, `Smooth`, `put_profile`, `Retrieval`,
-`Retrievals`, `Step`, `AveragingKernel`.
+`Step`, `AveragingKernel`.
 
 ## Identifiability and verdicts
 
@@ -63,7 +63,7 @@ from inversion.fit.priors import LogNormal, MarkovField, Smooth
 from inversion.fit.problem import Problem
 from inversion.fit.profiles import AveragingKernel, put_profile
 from inversion.fit.quality import Verdict, judge_fit, judge_fits, judge_record
-from inversion.fit.result import Retrieval, Retrievals
+from inversion.fit.result import Retrieval
 from inversion.fit.retrieval import retrieve
 from inversion.fit.retrieval_many import retrieve_many
 from inversion.fit.unknowns import Unknown
@@ -102,7 +102,6 @@ __all__ = [
     "Smooth",
     "put_profile",
     "Retrieval",
-    "Retrievals",
     "Step",
     "AveragingKernel",
     # Identifiability and verdicts.

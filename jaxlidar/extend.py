@@ -3,8 +3,8 @@
 For laws, pulses and surfaces of your own, and for packages on top such as `inversion`:
 
 - fields: `as_array`, `as_scalar` and, in NumPy's double precision, `as_numpy` convert them, and refuse
-  booleans, times and masked elements; `check_range`, `check_number`, `check_integer`, `check_choice` refuse
-  values, `check_kind`, `check_numbers`, `check_key` objects of another type; `concrete`
+  booleans, times and masked elements; `check_range`, `check_number`, `check_integer`, `check_index`,
+  `check_choice` refuse values, `check_kind`, `check_numbers`, `check_key` objects of another type; `concrete`
   returns the value of an array, or None where a JAX transformation is tracing it; `even_step` the step of
   times or heights, and refuses uneven ones. `warn_user` warns at the line of the user's code.
 - directions: a `Vec` is a tuple of three arrays, x, y and z; `dot`, `scale`, `add`, `normalise`; `polar` and
@@ -28,6 +28,7 @@ from jaxlidar._fields.checks import (
     as_numpy,
     as_scalar,
     check_choice,
+    check_index,
     check_integer,
     check_key,
     check_kind,
@@ -73,6 +74,7 @@ __all__ = [
     "as_numpy",
     "as_scalar",
     "check_choice",
+    "check_index",
     "check_integer",
     "check_key",
     "check_kind",

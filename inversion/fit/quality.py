@@ -82,7 +82,7 @@ class Verdict(NamedTuple):
 
 @runtime_checkable
 class JudgedFit(Protocol):
-    """The quantities of a fit (`Retrieval`), or of many (`Retrievals`), on which a verdict depends."""
+    """The quantities of a fit (`Retrieval`) on which a verdict depends."""
 
     @property
     def values(self) -> Mapping[str, Any]: ...
@@ -137,14 +137,48 @@ def judge_fit(fit: JudgedFit, *, about: Sequence[str] | None = None) -> Verdict:
     >>> inversion.judge_fit(fit).quality
     'bad'
     """
-    # The index () leaves the quantities of a single fit as they are.
-    return _judge(fit, about, ())
+    names = list(fit.values) if about is None else list(about)
+    for name in names:
+        if name not in fit.values:
+            raise ValueError(f"about has {name!r}; admissible are {', '.join(map(repr, fit.values))}")
+
+    def failing(quantity: Mapping[str, Any], fails: Callable[[Any], Any], exempt: Iterable[str] = ()) -> str:
+        """Return the names of the unknowns with any failing value."""
+        return ", ".join(n for n in names if n not in exempt and np.any(fails(np.asarray(quantity[n]))))
+
+    failures = []
+    if not float(fit.converged):
+        failures.append((_BAD, "not converged"))
+    chi2, n_samples = float(fit.reduced_chi2), max(float(fit.independent_samples), 1.0)
+    # The standard deviation of reduced chi-squared is sqrt(2 / n).
+    scatter = [1.0 + k * np.sqrt(2.0 / n_samples) for k in _CHI2_SIGMAS]
+    limits = np.maximum(_CHI2_LIMITS, scatter)
+    misfit = f"misfit: reduced chi-squared {chi2:.3g}"
+    # Written so that NaN fails.
+    if not chi2 <= limits[0]:
+        failures.append((_DOUBTFUL if chi2 <= limits[1] else _BAD, misfit))
+    relative_stderr = {n: fit.stderr[n] / np.diff(np.asarray(fit.bounds[n], float), axis=0)[0] for n in names}
+    if undetermined := failing(relative_stderr, lambda s: s > _UNIFORM_SIGMA):
+        failures.append((_DOUBTFUL, f"undetermined: {undetermined}"))
+    # Layers without plants lie at their bound, and smoothness priors fill in layers: both are as intended.
+    has_smooth_prior = set(fit.strength)
+    if at_bound := failing(fit.at_bound, np.asarray, exempt=has_smooth_prior):
+        failures.append((_DOUBTFUL, f"at a bound: {at_bound}"))
+    from_prior = failing(fit.prior_share, lambda f: f > _MAX_PRIOR_FRACTION, exempt=has_smooth_prior)
+    if from_prior:
+        failures.append((_DOUBTFUL, f"from the prior: {from_prior}"))
+    if (rise := float(fit.second_minimum)) < _MIN_SECOND_MINIMUM:
+        failures.append((_DOUBTFUL, f"second minimum: {rise:.2g} above in chi-squared"))
+    is_named = any(reason == misfit for _, reason in failures)
+    if failures and not is_named and chi2 > scatter[0]:
+        failures.append((_DOUBTFUL, misfit))
+    return _worst_of(failures)
 
 
-def judge_fits(fits: Any, *, about: Sequence[str] | None = None) -> tuple[Verdict, ...]:
+def judge_fits(fits: Iterable[JudgedFit], *, about: Sequence[str] | None = None) -> tuple[Verdict, ...]:
     """Judge whether each of many fits can be trusted: see `judge_fit`.
 
-    **Arguments:** `fits`: a `Retrievals`, the result of `retrieve_many`. `about`: as for `judge_fit`.
+    **Arguments:** `fits`: the `Retrieval` of `retrieve_many`. `about`: as for `judge_fit`.
 
     **Returns:** a `Verdict` for each footprint.
 
@@ -163,53 +197,7 @@ def judge_fits(fits: Any, *, about: Sequence[str] | None = None) -> tuple[Verdic
     >>> inversion.judge_fits(fits, about=["brightness"])
     (Verdict(quality='good', reasons=()),)
     """
-    return tuple(_judge(fits, about, i) for i in range(len(fits.status)))
-
-
-def _judge(fit: JudgedFit, about: Sequence[str] | None, index: Any) -> Verdict:
-    """Judge a fit (index ()), or one of many by its index."""
-
-    def scalar(x: Any) -> float:
-        return float(np.asarray(x)[index])
-
-    names = list(fit.values) if about is None else list(about)
-    for name in names:
-        if name not in fit.values:
-            raise ValueError(f"about has {name!r}; admissible are {', '.join(map(repr, fit.values))}")
-
-    def failing(quantity: Mapping[str, Any], fails: Callable[[Any], Any], exempt: Iterable[str] = ()) -> str:
-        """Return the names of the unknowns with any failing value."""
-        return ", ".join(
-            n for n in names if n not in exempt and np.any(fails(np.asarray(quantity[n])[index]))
-        )
-
-    failures = []
-    if not scalar(fit.converged):
-        failures.append((_BAD, "not converged"))
-    chi2, n_samples = scalar(fit.reduced_chi2), max(scalar(fit.independent_samples), 1.0)
-    # The standard deviation of reduced chi-squared is sqrt(2 / n).
-    scatter = [1.0 + k * np.sqrt(2.0 / n_samples) for k in _CHI2_SIGMAS]
-    limits = np.maximum(_CHI2_LIMITS, scatter)
-    misfit = f"misfit: reduced chi-squared {chi2:.3g}"
-    # Written so that NaN fails.
-    if not chi2 <= limits[0]:
-        failures.append((_DOUBTFUL if chi2 <= limits[1] else _BAD, misfit))
-    relative_stderr = {n: fit.stderr[n] / np.diff(np.asarray(fit.bounds[n], float), axis=0)[0] for n in names}
-    if undetermined := failing(relative_stderr, lambda s: s > _UNIFORM_SIGMA):
-        failures.append((_DOUBTFUL, f"undetermined: {undetermined}"))
-    # Layers without plants lie at their bound, and smoothness priors fill in layers: both are as intended.
-    has_smooth_prior = set(fit.strength)
-    if at_bound := failing(fit.at_bound, np.asarray, exempt=has_smooth_prior):
-        failures.append((_DOUBTFUL, f"at a bound: {at_bound}"))
-    from_prior = failing(fit.prior_share, lambda f: f > _MAX_PRIOR_FRACTION, exempt=has_smooth_prior)
-    if from_prior:
-        failures.append((_DOUBTFUL, f"from the prior: {from_prior}"))
-    if (rise := scalar(fit.second_minimum)) < _MIN_SECOND_MINIMUM:
-        failures.append((_DOUBTFUL, f"second minimum: {rise:.2g} above in chi-squared"))
-    is_named = any(reason == misfit for _, reason in failures)
-    if failures and not is_named and chi2 > scatter[0]:
-        failures.append((_DOUBTFUL, misfit))
-    return _worst_of(failures)
+    return tuple(judge_fit(fit, about=about) for fit in fits)
 
 
 def judge_record(

@@ -161,7 +161,7 @@ def test_echoes_decide_which_scene_is_fitted(example, tmp_path, monkeypatch, cap
             values |= {"receiver width": np.where(np.array([r.shot.index for r in records]) == 3, 3.0, 0.1)}
         errors = {name: np.full_like(v, 0.1) for name, v in values.items()}
         n_values = sum(v[0].size for v in values.values())
-        fits = inversion.Retrievals(
+        fits = inversion.Retrieval(
             values=values,
             stderr=errors,
             robust_stderr=errors,
@@ -176,6 +176,8 @@ def test_echoes_decide_which_scene_is_fitted(example, tmp_path, monkeypatch, cap
             bounds={},
             converged=np.ones(n, bool),
             steps=np.ones(n, int),
+            simulation_error={},
+            residuals=np.zeros((n, 1, time.size)),
             fitted=np.zeros((n, 1, time.size)),
             status=("converged",) * n,
             labels=("",) * n_values,
