@@ -2,8 +2,7 @@
 
 ## Fits with a model
 
-`Problem`, `retrieve`, `retrieve_many`, `Unknown`, `LogNormal`, `Smooth`, `put_profile`, `Retrieval`,
-`Retrievals`.
+`Problem`, `retrieve`, `retrieve_many`, `Unknown`, `LogNormal`, `Smooth`, `put_profile`, `Retrieval`.
 
 ## Identifiability and verdicts
 
@@ -59,7 +58,7 @@ from inversion.fit.priors import LogNormal, MarkovField, Smooth
 from inversion.fit.problem import Problem
 from inversion.fit.profiles import put_profile
 from inversion.fit.quality import Verdict, judge_fit, judge_record
-from inversion.fit.result import Retrieval, Retrievals
+from inversion.fit.result import Retrieval
 from inversion.fit.retrieval import retrieve
 from inversion.fit.retrieval_many import retrieve_many
 from inversion.fit.unknowns import Unknown
@@ -96,7 +95,6 @@ __all__ = [
     "Smooth",
     "put_profile",
     "Retrieval",
-    "Retrievals",
     # Identifiability and verdicts.
     "cramer_rao",
     "profile_likelihood",

@@ -4,7 +4,7 @@ The group of entry points "jaxlidar.files" in pyproject.toml names this module f
 `jaxlidar.open` finds it by the name of the class in a file.
 """
 
-from inversion.fit.result import Retrieval, Retrievals
+from inversion.fit.result import Retrieval
 from inversion.scene.scene_retrieval import SceneRetrieval
 from jaxlidar.io import keep_as_netcdf
 
@@ -33,25 +33,17 @@ _QUANTITIES = {
 
 keep_as_netcdf(
     Retrieval,
-    "scene properties retrieved from a lidar waveform",
+    "scene properties retrieved from lidar waveforms",
     {
         **_QUANTITIES,
         "simulation_error": (_UNIT_OF_UNKNOWN, "part of the standard error from the simulation's noise"),
-        "correlation": ("1", "correlation of the unknowns, in the order of labels"),
         "residuals": ("1", "observed minus fitted, whitened by the covariance of the noise"),
-    },
-    dimensions={"n": "labels", "bins": "time", "wavelengths": "wavelength"},
-)
-keep_as_netcdf(
-    Retrievals,
-    "scene properties retrieved from many lidar waveforms",
-    {
-        **_QUANTITIES,
         "converged": ("1", "1 for a fit that ended at a minimum"),
         "steps": ("1", "waveforms simulated, each with its Jacobian"),
         "fitted": ("1", "fitted apparent reflectance per sample, before the recorder"),
     },
     dimensions={"n": "labels", "footprints": "footprint", "bins": "time", "wavelengths": "wavelength"},
+    rows="footprints",
 )
 keep_as_netcdf(
     SceneRetrieval,

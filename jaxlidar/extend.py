@@ -3,7 +3,7 @@
 For laws, pulses and surfaces of your own, and for packages on top such as `inversion`:
 
 - fields: `as_array`, `as_scalar` and, in NumPy's double precision, `as_numpy` convert them, and refuse
-  booleans, times and masked elements; `check_range`, `check_number`, `check_integer` refuse
+  booleans, times and masked elements; `check_range`, `check_number`, `check_integer`, `check_index` refuse
   values, `check_kind`, `check_numbers`, `check_key` objects of another type; `concrete`
   returns the value of an array, or None where a JAX transformation is tracing it; `even_step` the step of
   times or heights, and refuses uneven ones. `warn_user` warns at the line of the user's code.
@@ -27,6 +27,7 @@ from jaxlidar._fields.checks import (
     as_array,
     as_numpy,
     as_scalar,
+    check_index,
     check_integer,
     check_key,
     check_kind,
@@ -70,6 +71,7 @@ __all__ = [
     "as_numpy",
     "as_scalar",
     "barrier",
+    "check_index",
     "check_integer",
     "check_key",
     "check_kind",

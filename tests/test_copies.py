@@ -139,12 +139,24 @@ def fit():
     wave = jl.simulate(LIDAR, jl.Scene(ground=jl.Ground()), key=jax.random.key(0))
     values = {"<height>": jax.numpy.asarray(0.5)}
     matrix, details = jax.numpy.ones((1, 1)), {"steps": 3, "history": (1.0,), "labels": ("<height>",)}
+    by_name = ("values", "stderr", "robust_stderr", "prior_share", "simulation_error")
+    scalars = ("reduced_chi2", "second_minimum", "independent_samples")
     return inversion.Retrieval(
-        values, values, values, values, {"<height>": values["<height>"] > 1.0}, values, matrix, matrix, SCENE,
-        wave, 0.5 + 0 * wave.reflectance, matrix[0, 0], matrix[0, 0], matrix[0, 0], matrix, {},
-        {"<height>": jax.numpy.array([0.0, 1.0])},
-        converged=True, status="done", **details,
-    )  # fmt: skip
+        **dict.fromkeys(by_name, values),
+        **dict.fromkeys(scalars, matrix[0, 0]),
+        at_bound={"<height>": values["<height>"] > 1.0},
+        covariance=matrix,
+        averaging=matrix,
+        strength={},
+        bounds={"<height>": np.array([0.0, 1.0])},
+        residuals=0.5 + 0 * wave.reflectance,
+        fitted=wave.reflectance,
+        scene=SCENE,
+        waveform=wave,
+        converged=True,
+        status="done",
+        **details,
+    )
 
 
 def pictures(page):

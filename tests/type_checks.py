@@ -7,7 +7,7 @@ from beartype import BeartypeConf, beartype
 # In results of surveys a `NotKept` stands for an array that was not kept, and a `StoredArray` for one
 # that is read where it is used. A `Recorder` has errors of its own for objects of a wrong type, which are
 # tested.
-_WITHOUT_CHECKS = {f"{name}.__init__" for name in ("Waveforms", "Waveform", "Truth", "Recorder")}
+_WITHOUT_CHECKS = {f"{name}.__init__" for name in ("Waveforms", "Waveform", "Truth", "Retrieval", "Recorder")}
 
 
 def check_types(function: Callable) -> Callable:

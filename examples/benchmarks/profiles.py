@@ -166,7 +166,7 @@ def compare_methods(
     largest = stand(np.full(LAYERS, 0.1), 45.0)
     plan = jl.plan(LIDAR, largest, max_orders=1, window=WINDOW, n_rays=RAYS // 8)
 
-    def fit(selected: slice, path=None) -> inversion.Retrievals:
+    def fit(selected: slice, path=None) -> inversion.Retrieval:
         problem = inversion.Problem(
             observed[selected, None],
             LIDAR,
@@ -242,7 +242,7 @@ def time_batch(number: int) -> dict:
     start = stand(np.full(LAYERS, 0.1), columns=1)
     plan = jl.plan(LIDAR, start, max_orders=1, window=window, n_rays=1)
 
-    def fit(selected: slice) -> inversion.Retrievals:
+    def fit(selected: slice) -> inversion.Retrieval:
         problem = inversion.Problem(
             observed[selected, None],
             LIDAR,

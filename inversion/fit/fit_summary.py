@@ -3,7 +3,7 @@
 `FitSummary` is the one place in which the quantities of a fit are listed. Each field names its axes and its
 kind of number; from these,
 
-- `inversion.fit.result` makes a `Retrieval` from one summary and a `Retrievals` from many;
+- `inversion.fit.result` makes a `Retrieval` from one summary, or from many;
 - `to_arrays` and `from_arrays` write a row of a store, and read it.
 
 `FitDetails` holds what only the result of a single fit has.
@@ -89,6 +89,8 @@ class FitSummary:
     - `strength`: of the smoothness priors.
     - `converged`, `status`: end of the fit.
     - `steps`: number of simulations.
+    - `simulation_error`: part of the standard errors that is the simulation's own noise.
+    - `residuals`: observed minus fitted, whitened; zero for samples that are left out.
     - `fitted`: simulated apparent reflectance at the estimates, before the recorder (no receiver response,
       scale or offset).
     """
@@ -110,6 +112,8 @@ class FitSummary:
     converged: bool = dataclasses.field(metadata=_axes(kind="b"))
     status: str = dataclasses.field(metadata=_axes(kind="U"))
     steps: int = dataclasses.field(metadata=_axes(kind="i"))
+    simulation_error: np.ndarray = dataclasses.field(metadata=_axes("unknowns"))
+    residuals: np.ndarray = dataclasses.field(metadata=_axes("wavelengths bins"))
     fitted: np.ndarray = dataclasses.field(metadata=_axes("wavelengths bins"))
 
     @staticmethod
@@ -138,8 +142,6 @@ class FitSummary:
 class FitDetails:
     """Further quantities of one fit, which are neither stored nor given for many fits.
 
-    - `simulation_error`: (n,) part of the standard errors that is the simulation's own noise.
-    - `residuals`: (wavelengths, bins) observed minus fitted, whitened; zero for samples that are left out.
     - `waveform_stderr`: (wavelengths, bins) standard error of the simulated waveform.
     - `cost`: chi-squared by the noise of measurement and pulse, without the simulation's, plus `prior_cost`:
       ranks minima.
@@ -151,8 +153,6 @@ class FitDetails:
     - `evaluation`: the simulation at the estimates.
     """
 
-    simulation_error: np.ndarray
-    residuals: np.ndarray
     waveform_stderr: np.ndarray
     cost: float
     prior_cost: float
@@ -182,8 +182,6 @@ class CompletedFit(NamedTuple):
         record = np.zeros((sizes.wavelengths, sizes.bins))
         nothing = np.zeros(0)
         details = FitDetails(
-            simulation_error=np.zeros(sizes.unknowns),
-            residuals=record,
             waveform_stderr=record,
             cost=0.0,
             prior_cost=0.0,

@@ -176,7 +176,7 @@ class DifferentiableFit(NamedTuple):
     ) -> "DifferentiableFit":
         """Return a result with its derivatives, all in JAX's precision."""
         without_scene = eqx.tree_at(lambda r: r.scene, retrieval, None)
-        return DifferentiableFit(without_scene, *jax.tree.map(jnp.asarray, (values, derivatives)))
+        return DifferentiableFit(*jax.tree.map(jnp.asarray, (without_scene, values, derivatives)))
 
 
 class DifferentiatedModel(NamedTuple):

@@ -33,7 +33,7 @@ The thresholds hold for any instrument; the checks of a record need several samp
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import Any, NamedTuple, Protocol, overload, runtime_checkable
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import ArrayLike, Float
@@ -81,8 +81,8 @@ class Verdict(NamedTuple):
 
 
 @runtime_checkable
-class _JudgedQuantities(Protocol):
-    """The quantities on which a verdict depends, of a fit or of many."""
+class JudgedFit(Protocol):
+    """The quantities of a fit (`Retrieval`) on which a verdict depends."""
 
     @property
     def values(self) -> Mapping[str, Any]: ...
@@ -102,22 +102,8 @@ class _JudgedQuantities(Protocol):
     def independent_samples(self) -> Any: ...
     @property
     def second_minimum(self) -> Any: ...
-
-
-@runtime_checkable
-class _JudgedFit(_JudgedQuantities, Protocol):
-    """A fit, such as `Retrieval`."""
-
     @property
-    def converged(self) -> bool: ...
-
-
-@runtime_checkable
-class _JudgedFits(_JudgedQuantities, Protocol):
-    """Many fits, such as `Retrievals`."""
-
-    @property
-    def converged(self) -> np.ndarray: ...
+    def converged(self) -> Any: ...
 
 
 def _worst_of(failures: Iterable[tuple[str, str]]) -> Verdict:
@@ -126,28 +112,18 @@ def _worst_of(failures: Iterable[tuple[str, str]]) -> Verdict:
     return Verdict(ordered[0][0] if ordered else _GOOD, tuple(reason for _, reason in ordered))
 
 
-@overload
-def judge_fit(fit: _JudgedFits, *, about: Sequence[str] | None = None) -> tuple[Verdict, ...]: ...
-
-
-@overload
-def judge_fit(fit: _JudgedFit, *, about: Sequence[str] | None = None) -> Verdict: ...
-
-
-def judge_fit(
-    fit: _JudgedFit | _JudgedFits, *, about: Sequence[str] | None = None
-) -> Verdict | tuple[Verdict, ...]:
+def judge_fit(fit: JudgedFit, *, about: Sequence[str] | None = None) -> Verdict:
     """Judge whether a fit can be trusted, by the first table of `inversion.fit.quality`.
 
     **Arguments:**
 
-    - `fit`: a `Retrieval`, the result of `retrieve`, or the `Retrievals` of `retrieve_many`.
+    - `fit`: a `Retrieval` of one record. One of many has the verdicts in its `quality`.
     - `about`: names of the unknowns that the verdict is about; bounds and priors of others are ignored.
       Default None: all.
 
-    **Returns:** a `Verdict`; of many fits, one for each.
+    **Returns:** a `Verdict`.
 
-    **Raises:** ValueError for a name that the fit does not have.
+    **Raises:** ValueError for a name that the fit does not have, and for a fit of many records.
 
     **Example:** the ground lies above the bounds of its height.
 
@@ -161,18 +137,8 @@ def judge_fit(
     >>> inversion.judge_fit(fit).quality
     'bad'
     """
-    if np.ndim(fit.converged) == 0:
-        # The index () leaves the quantities of a single fit as they are.
-        return _judge(fit, about, ())
-    return tuple(_judge(fit, about, i) for i in range(np.size(fit.converged)))
-
-
-def _judge(fit: _JudgedFit | _JudgedFits, about: Sequence[str] | None, index: Any) -> Verdict:
-    """Judge a fit (index ()), or one of many by its index."""
-
-    def scalar(x: Any) -> float:
-        return float(np.asarray(x)[index])
-
+    if np.ndim(fit.converged) > 0:
+        raise ValueError(f"fit has {np.size(fit.converged)} records; admissible is one: judge each, fit[i]")
     names = list(fit.values) if about is None else list(about)
     for name in names:
         if name not in fit.values:
@@ -180,14 +146,12 @@ def _judge(fit: _JudgedFit | _JudgedFits, about: Sequence[str] | None, index: An
 
     def failing(quantity: Mapping[str, Any], fails: Callable[[Any], Any], exempt: Iterable[str] = ()) -> str:
         """Return the names of the unknowns with any failing value."""
-        return ", ".join(
-            n for n in names if n not in exempt and np.any(fails(np.asarray(quantity[n])[index]))
-        )
+        return ", ".join(n for n in names if n not in exempt and np.any(fails(np.asarray(quantity[n]))))
 
     failures = []
-    if not scalar(fit.converged):
+    if not float(fit.converged):
         failures.append((_BAD, "not converged"))
-    chi2, n_samples = scalar(fit.reduced_chi2), max(scalar(fit.independent_samples), 1.0)
+    chi2, n_samples = float(fit.reduced_chi2), max(float(fit.independent_samples), 1.0)
     # The standard deviation of reduced chi-squared is sqrt(2 / n).
     scatter = [1.0 + k * np.sqrt(2.0 / n_samples) for k in _CHI2_SIGMAS]
     limits = np.maximum(_CHI2_LIMITS, scatter)
@@ -205,12 +169,37 @@ def _judge(fit: _JudgedFit | _JudgedFits, about: Sequence[str] | None, index: An
     from_prior = failing(fit.prior_share, lambda f: f > _MAX_PRIOR_FRACTION, exempt=has_smooth_prior)
     if from_prior:
         failures.append((_DOUBTFUL, f"from the prior: {from_prior}"))
-    if (rise := scalar(fit.second_minimum)) < _MIN_SECOND_MINIMUM:
+    if (rise := float(fit.second_minimum)) < _MIN_SECOND_MINIMUM:
         failures.append((_DOUBTFUL, f"second minimum: {rise:.2g} above in chi-squared"))
     is_named = any(reason == misfit for _, reason in failures)
     if failures and not is_named and chi2 > scatter[0]:
         failures.append((_DOUBTFUL, misfit))
     return _worst_of(failures)
+
+
+def judge_fits(fits: Iterable[JudgedFit], *, about: Sequence[str] | None = None) -> tuple[Verdict, ...]:
+    """Judge whether each of many fits can be trusted: see `judge_fit`.
+
+    **Arguments:** `fits`: the `Retrieval` of `retrieve_many`. `about`: as for `judge_fit`.
+
+    **Returns:** a `Verdict` for each footprint.
+
+    **Raises:** ValueError for a name that the fits do not have.
+
+    **Example:**
+
+    >>> import jaxlidar as jl
+    >>> import inversion, jax
+    >>> scene = jl.Scene(ground=jl.Ground(height=0.5))
+    >>> wave = jl.simulate(jl.Lidar(), scene, key=jax.random.key(0))
+    >>> unknown = inversion.Unknown("ground.reflectance", bounds=(0.0, 1.0), name="brightness")
+    >>> records, time = wave.reflectance[None], wave.time
+    >>> problem = inversion.Problem(records, jl.Lidar(), scene, [unknown], noise=0.001, time=time)
+    >>> fits = inversion.retrieve_many(problem, key=jax.random.key(1))
+    >>> inversion.judge_fits(fits, about=["brightness"])
+    (Verdict(quality='good', reasons=()),)
+    """
+    return tuple(judge_fit(fit, about=about) for fit in fits)
 
 
 def judge_record(

@@ -1,7 +1,8 @@
-"""Results of retrievals: `Retrieval` of one waveform, `Retrievals` of many, both made from `FitSummary`."""
+"""Results of retrievals: `Retrieval` of one record, or of many, made from `FitSummary`."""
 
+import dataclasses
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, final
 
 import equinox as eqx
@@ -12,17 +13,22 @@ from jaxtyping import Array, Bool, Float, Int
 
 from inversion.fit.fit_summary import CompletedFit, FitSummary, short_text
 from inversion.fit.profiles import AbstractPosterior
-from inversion.fit.quality import Verdict, judge_fit
+from inversion.fit.quality import judge_fit
 from inversion.fit.uncertainty import correlation_of
 from inversion.fit.unknowns import BoundUnknown, bounds_by_name, flat_labels, smooth_names, split_by_name
 from jaxlidar import Scene, Waveform
+from jaxlidar.extend import check_index
 from jaxlidar.io import save
 from jaxlidar.io.datasets import datasets_of, variables_by_item
 
 
 @final
 class Retrieval(AbstractPosterior):
-    """The result of `retrieve`: values of the unknowns, their standard errors, and the fitted scene.
+    """The result of `retrieve` or `retrieve_many`: values of unknowns, their standard errors, and the fit.
+
+    The result of many records has NumPy arrays with a leading axis of footprints, in the order given.
+    `fits[i]` is the `Retrieval` of record i, and `len(fits)` their number; both are refused (TypeError) for
+    the result of one record. `retrieve` alone gives `scene`, `waveform` and `history`.
 
     Unknowns are in their natural units, keyed by name. The rows of `covariance` and `correlation` are the
     flattened unknowns in the order given, named by `labels`. `print(fit)` shows a summary: values, standard
@@ -40,9 +46,10 @@ class Retrieval(AbstractPosterior):
     - `simulation_error`: the part of `stderr` that comes from the simulation's own noise; it falls with
       `n_photons`.
     - `covariance`, `correlation`: (n, n). An unknown of infinite variance has no covariance with others.
-    - `scene`: the fitted scene.
+    - `scene`: the fitted scene; None for many records.
     - `waveform`: the fitted waveform, before the recorder (no receiver response, scale or offset); its
-      `stderr` is the simulation's.
+      `stderr` is the simulation's. None for many records.
+    - `fitted`: (wavelengths, bins) its apparent reflectance.
     - `residuals`: (wavelengths, bins) observed minus fitted, whitened (for independent errors: over the
       standard deviation); zero for samples that were left out.
     - `reduced_chi2`: sum of squared residuals over the number of samples less that of determined unknowns.
@@ -53,11 +60,11 @@ class Retrieval(AbstractPosterior):
       correlated.
     - `averaging`: (n, n) averaging kernel, d estimate / d truth: see `averaging_kernel`.
     - `strength`: of each smoothness prior (`Smooth`), as given or by the data.
-    - `bounds`: (2, ...) lower and upper bounds of each unknown.
+    - `bounds`: (2, ...) lower and upper bounds of each unknown, the same for all records.
     - `converged`: True if the fit ended at a minimum.
-    - `status`: a sentence on the end of the fit.
+    - `status`: a sentence on the end of the fit; of many, one for each.
     - `steps`: number of waveforms simulated, with few photons or all, each with its Jacobian.
-    - `history`: reduced chi-squared of every call of `progress`; see `Step`.
+    - `history`: reduced chi-squared of every call of `progress`; see `Step`. Empty for many records.
     - `labels`: names of the flattened unknowns.
 
     **Example:**
@@ -73,34 +80,56 @@ class Retrieval(AbstractPosterior):
     (True, ('ground.height',), '0.500 m')
     """
 
-    # By name, in the shape of the unknown.
+    # By name, in the shape of the unknown after the leading axis.
     values: dict[str, Float[Array, "..."]]
     stderr: dict[str, Float[Array, "..."]]
     robust_stderr: dict[str, Float[Array, "..."]]
     prior_share: dict[str, Float[Array, "..."]]
     at_bound: dict[str, Bool[Array, "..."]]
     simulation_error: dict[str, Float[Array, "..."]]
-    covariance: Float[Array, "n n"]
-    correlation: Float[Array, "n n"]
-    scene: Scene
-    waveform: Waveform
-    residuals: Float[Array, "wavelengths bins"]
-    reduced_chi2: Float[Array, ""]
-    second_minimum: Float[Array, ""]
-    independent_samples: Float[Array, ""]
-    averaging: Float[Array, "n n"]
-    strength: dict[str, Float[Array, ""]]
-    bounds: dict[str, Float[Array, "2 ..."]]
-    converged: bool = eqx.field(static=True)
-    status: str = eqx.field(static=True)
-    steps: int = eqx.field(static=True)
-    history: tuple[float, ...] = eqx.field(static=True)
+    covariance: Float[Array, "*footprints n n"]
+    averaging: Float[Array, "*footprints n n"]
+    reduced_chi2: Float[Array, "*footprints"]
+    second_minimum: Float[Array, "*footprints"]
+    independent_samples: Float[Array, "*footprints"]
+    strength: dict[str, Float[Array, "*footprints"]]
+    bounds: dict[str, Float[np.ndarray, "2 ..."]]
+    converged: Bool[Array, "*footprints"]
+    steps: Int[Array, "*footprints"]
+    residuals: Float[Array, "*footprints wavelengths bins"]
+    fitted: Float[Array, "*footprints wavelengths bins"]
+    # A text, or a tuple of them.
+    status: Any = eqx.field(static=True)
     labels: tuple[str, ...] = eqx.field(static=True)
+    # None for many records: declared as those of one, so that type checkers know their fields.
+    scene: Scene = None  # pyright: ignore[reportAssignmentType]
+    waveform: Waveform = None  # pyright: ignore[reportAssignmentType]
+    history: tuple[float, ...] = eqx.field(static=True, default=())
 
     @property
-    def quality(self) -> Verdict:
-        """Verdict on the fit, with reasons: `inversion.judge_fit` with all unknowns."""
-        return judge_fit(self)
+    def correlation(self) -> Float[np.ndarray, "*footprints n n"]:
+        """Correlation of the flattened unknowns, (n, n)."""
+        covariance = np.asarray(self.covariance)
+        matrices = covariance.reshape(-1, *covariance.shape[-2:])
+        return np.stack([correlation_of(matrix) for matrix in matrices]).reshape(covariance.shape)
+
+    def __len__(self) -> int:
+        if np.ndim(self.reduced_chi2) == 0:
+            raise TypeError("this is the retrieval of one record: it has no axis of footprints")
+        return len(self.reduced_chi2)
+
+    def __getitem__(self, footprint: int) -> "Retrieval":
+        i = check_index("footprint", footprint, len(self))
+        row = jax.tree.map(lambda a: a[i], dataclasses.replace(self, bounds=None))
+        return dataclasses.replace(row, bounds=self.bounds, status=self.status[i])
+
+    def __iter__(self) -> Iterator["Retrieval"]:
+        return (self[i] for i in range(len(self)))
+
+    @property
+    def quality(self) -> Any:
+        """`Verdict` on the fit, or a tuple of them: `inversion.judge_fit` with all unknowns."""
+        return judge_fit(self) if isinstance(self.status, str) else tuple(map(judge_fit, self))
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the result as a netCDF file, which `jaxlidar.open` reads.
@@ -111,100 +140,18 @@ class Retrieval(AbstractPosterior):
         """
         save(self, path)
 
-    def __str__(self) -> str:
-        width = max(map(len, self.values))
-        rows = [
-            f"{name.ljust(width)}  {short_text(value)} +- {short_text(self.stderr[name])}"
-            f" (robust {short_text(self.robust_stderr[name])})"
-            for name, value in self.values.items()
-        ]
-        return "\n".join([*rows, f"reduced chi2 {float(self.reduced_chi2):.3g}; {self.status}"])
-
-    def _repr_html_(self) -> str:
-        """Return the HTML that notebooks show: the summary, the fitted waveform and its residuals."""
-        # matplotlib takes a while to import: only when a notebook shows the result.
-        from jaxlidar.plot.html import fit_html
-
-        return fit_html(str(self), self.waveform, self.residuals)
-
-
-@final
-class Retrievals(AbstractPosterior):
-    """The results of `retrieve_many`: one fit per footprint, in the order given.
-
-    Arrays have a leading axis `footprints`. The quantities are those of `Retrieval`.
-
-    - `values`: by name, (footprints, ...) best values.
-    - `stderr`: by name, (footprints, ...) one standard error; infinite for unknowns that neither
-      data nor priors constrain to within their bounds.
-    - `robust_stderr`, `prior_share`, `at_bound`: by name, (footprints, ...).
-    - `covariance`, `averaging`: (footprints, n, n).
-    - `strength`: by name, (footprints,). `bounds`: by name, (2, ...), those of all footprints.
-    - `reduced_chi2`, `second_minimum`, `independent_samples`: (footprints,).
-    - `converged`: (footprints,) True for fits that ended at a minimum.
-    - `steps`: (footprints,) number of waveforms simulated, with few photons or all, each with its Jacobian.
-    - `fitted`: (footprints, wavelengths, bins) apparent reflectance, before the recorder (no
-      receiver response, scale or offset).
-    - `status`: a sentence for each footprint on the end of its fit.
-    - `labels`: names of the rows of `covariance`.
-
-    **Example:**
-
-    >>> import jaxlidar as jl
-    >>> import inversion, jax
-    >>> scene = jl.Scene(ground=jl.Ground(height=0.5))
-    >>> wave = jl.simulate(jl.Lidar(), scene, key=jax.random.key(0))
-    >>> unknown = inversion.Unknown(lambda s: s.ground.reflectance, bounds=(0.0, 1.0), name="brightness")
-    >>> records, time = wave.reflectance[None], wave.time
-    >>> problem = inversion.Problem(records, jl.Lidar(), scene, [unknown], noise=0.001, time=time)
-    >>> fits = inversion.retrieve_many(problem, key=jax.random.key(1))
-    >>> fits.labels, fits.covariance.shape, fits.converged.tolist()
-    (('brightness',), (1, 1, 1), [True])
-    """
-
-    values: dict[str, Float[np.ndarray, "footprints ..."]]
-    stderr: dict[str, Float[np.ndarray, "footprints ..."]]
-    robust_stderr: dict[str, Float[np.ndarray, "footprints ..."]]
-    prior_share: dict[str, Float[np.ndarray, "footprints ..."]]
-    at_bound: dict[str, Bool[np.ndarray, "footprints ..."]]
-    covariance: Float[np.ndarray, "footprints n n"]
-    reduced_chi2: Float[np.ndarray, " footprints"]
-    second_minimum: Float[np.ndarray, " footprints"]
-    independent_samples: Float[np.ndarray, " footprints"]
-    averaging: Float[np.ndarray, "footprints n n"]
-    strength: dict[str, Float[np.ndarray, " footprints"]]
-    bounds: dict[str, Float[np.ndarray, "2 ..."]]
-    converged: Bool[np.ndarray, " footprints"]
-    steps: Int[np.ndarray, " footprints"]
-    fitted: Float[np.ndarray, "footprints wavelengths bins"]
-    status: tuple[str, ...] = eqx.field(static=True)
-    labels: tuple[str, ...] = eqx.field(static=True)
-
-    @property
-    def quality(self) -> tuple[Verdict, ...]:
-        """Verdict on each fit, with reasons: `inversion.judge_fit` with all unknowns."""
-        return judge_fit(self)
-
-    def save(self, path: str | os.PathLike[str]) -> None:
-        """Write the results as a netCDF file, which `jaxlidar.open` reads.
-
-        **Arguments:** `path`: the file to write.
-
-        **Raises:** what `jaxlidar.io.save` raises.
-        """
-        save(self, path)
-
     def to_xarray(self) -> Any:
-        """The results as an `xarray.Dataset` over the dimension `footprint`.
+        """The results of many records as an `xarray.Dataset` over the dimension `footprint`.
 
         **Returns:** an `xarray.Dataset` with a variable for each unknown, "... stderr" for its standard
         error, "... robust stderr", "... prior share" and "... at bound", and `reduced_chi2`,
         `second_minimum`, `independent_samples`, `converged`, `steps`, `status` and `fitted`.
 
-        **Raises:** ImportError where xarray is not installed.
+        **Raises:** ImportError where xarray is not installed; TypeError for the result of one record.
         """
         import xarray
 
+        len(self)
         stored = datasets_of(self)["/"]
         columns: dict[str, Any] = {}
         for field in ("values", "stderr", "robust_stderr", "prior_share", "at_bound"):
@@ -218,6 +165,27 @@ class Retrievals(AbstractPosterior):
         columns["fitted"] = stored["fitted"].rename(time="bin")
         return xarray.Dataset(columns)
 
+    def __str__(self) -> str:
+        if not isinstance(self.status, str):
+            n_converged = int(np.sum(self.converged))
+            return f"{len(self)} fits of {', '.join(self.values)}: {n_converged} converged"
+        width = max(map(len, self.values))
+        rows = [
+            f"{name.ljust(width)}  {short_text(value)} +- {short_text(self.stderr[name])}"
+            f" (robust {short_text(self.robust_stderr[name])})"
+            for name, value in self.values.items()
+        ]
+        return "\n".join([*rows, f"reduced chi2 {float(self.reduced_chi2):.3g}; {self.status}"])
+
+    def _repr_html_(self) -> str | None:
+        """Return the HTML that notebooks show: the summary, the fitted waveform and its residuals."""
+        if self.waveform is None:
+            return None
+        # matplotlib takes a while to import: only when a notebook shows the result.
+        from jaxlidar.plot.html import fit_html
+
+        return fit_html(str(self), self.waveform, self.residuals)
+
 
 def retrieval_of(
     fit: CompletedFit, unknowns: Sequence[BoundUnknown], scene: Scene, waveform: Waveform
@@ -227,29 +195,21 @@ def retrieval_of(
     **Arguments:** `unknowns`: of the scene, then those of the recorder. `scene`, `waveform`: fitted.
     """
     quantities = _named_quantities(fit.summary.to_arrays(), unknowns)
-    # The waveform takes its place.
-    del quantities["fitted"]
-    # Static fields of the result: plain Python values.
     end_of_fit = {name: quantities.pop(name) for name in ("converged", "status", "steps")}
-    quantities |= {
-        "simulation_error": split_by_name(fit.details.simulation_error, unknowns),
-        "correlation": correlation_of(fit.summary.covariance),
-        "residuals": fit.details.residuals,
-        "bounds": bounds_by_name(unknowns),
-    }
     # JAX's precision, as for the scene and the waveform.
     return Retrieval(
         **jax.tree.map(jnp.asarray, quantities),
         **end_of_fit,
+        bounds=bounds_by_name(unknowns),
+        labels=flat_labels(unknowns),
         scene=scene,
         waveform=waveform,
         history=fit.details.history,
-        labels=flat_labels(unknowns),
     )
 
 
-def retrievals_of(summaries: Sequence[FitSummary], unknowns: Sequence[BoundUnknown]) -> Retrievals:
-    """Return the results of many fits, in their order.
+def retrievals_of(summaries: Sequence[FitSummary], unknowns: Sequence[BoundUnknown]) -> Retrieval:
+    """Return the result of many fits, in their order.
 
     **Arguments:** `unknowns`: of the scene, then those of the recorder.
     """
@@ -259,7 +219,7 @@ def retrievals_of(summaries: Sequence[FitSummary], unknowns: Sequence[BoundUnkno
     }
     # An equinox module cannot hold strings in an array.
     stacked["status"] = tuple(summary.status for summary in summaries)
-    return Retrievals(
+    return Retrieval(
         **_named_quantities(stacked, unknowns),
         bounds=bounds_by_name(unknowns),
         labels=flat_labels(unknowns),

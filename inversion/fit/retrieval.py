@@ -38,8 +38,8 @@ from jaxlidar import Lidar, Scene, Waveform, trace_scene, waveform_of
 from jaxlidar.extend import check_integer, check_key, check_kinds
 from jaxlidar.progress import ProgressOption, shows_progress
 
-# Programs have no sentences; neither do they have a status.
-_STATUS_IN_PROGRAM = "fitted within a compiled program, which does not tell how the fit ended"
+# Programs have no sentences: `converged` alone tells how the fit ended.
+_STATUS_IN_PROGRAM = "fitted within a compiled program, which has no words for the end of the fit"
 
 
 @shows_progress

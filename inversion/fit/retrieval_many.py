@@ -32,7 +32,7 @@ from inversion.fit.fit_summary import FitSummary
 from inversion.fit.model import Evaluation, ForwardModel, SimulationInputs, evaluate_scene
 from inversion.fit.planning import trace_sizes
 from inversion.fit.problem import BoundProblem, Problem, check_problem
-from inversion.fit.result import Retrievals, retrievals_of
+from inversion.fit.result import Retrieval, retrievals_of
 from inversion.fit.retrieval import solver_settings
 from inversion.fit.solver import (
     EvaluationRequest,
@@ -77,7 +77,7 @@ def retrieve_many(
     path: str | os.PathLike[str] | None = None,
     executor: Executor | None = None,
     progress: ProgressOption = None,
-) -> Retrievals:
+) -> Retrieval:
     """Retrieve the unknowns of a problem of many records, from each separately, as `retrieve` does from one.
 
     A fit that fails says so in its status and does not affect the others. All records share the random
@@ -101,7 +101,7 @@ def retrieve_many(
     - `progress`: True for a bar with the time left; or a function called with a `Progress` after every fit.
       Default None: silent.
 
-    **Returns:** a `Retrievals`, which does not depend on the number of workers.
+    **Returns:** a `Retrieval` with an axis of footprints, which does not depend on the number of workers.
 
     **Raises:** ValueError for a problem of one record and inadmissible arguments, as `retrieve` does, and for
     a `path` that is damaged, no Zarr store, or one of another problem, with what differs. TypeError for

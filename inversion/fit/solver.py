@@ -418,11 +418,11 @@ class LeastSquaresFit:
             converged=converged,
             status=status + self._notes(estimate.is_undetermined, at_low, at_high, is_leaving),
             steps=self.n_simulations,
+            simulation_error=estimate.simulation_error,
+            residuals=residuals,
             fitted=np.asarray(evaluation.reflectance),
         )
         details = FitDetails(
-            simulation_error=estimate.simulation_error,
-            residuals=residuals,
             waveform_stderr=np.asarray(np.broadcast_to(batch_stderr(evaluation.batches), is_fitted.shape)),
             cost=cost if iterate.is_finite else np.inf,
             prior_cost=prior_cost,
@@ -593,7 +593,7 @@ def compare_minima(best: CompletedFit, further_fits: Sequence[CompletedFit]) -> 
     """
     summary = best.summary
     # Residuals of samples that are left out are zero.
-    n_samples = max(np.count_nonzero(best.details.residuals), 1)
+    n_samples = max(np.count_nonzero(best.summary.residuals), 1)
     scale = summary.independent_samples / n_samples / max(summary.reduced_chi2, 1.0)
     least_chi2, least_variance = _chi2_with_noise(best, best.details.noise)
     second_minimum_rise, weighted_squares, weight = np.inf, np.zeros_like(summary.values), 1.0

@@ -31,7 +31,7 @@ from jaxtyping import Float, Int
 import jaxlidar as jl
 from inversion.fit.problem import Problem
 from inversion.fit.quality import Verdict, judge_fit
-from inversion.fit.result import Retrievals
+from inversion.fit.result import Retrieval
 from inversion.fit.retrieval_many import retrieve_many
 from inversion.fit.unknowns import Unknown
 from inversion.metrics.gedi import RECEIVER_SMOOTHING, judge_shot
@@ -98,7 +98,7 @@ class GediFits(NamedTuple):
     signal: Float[np.ndarray, "shots samples"]
     fitted: Float[np.ndarray, "shots samples"]
     numbers: Int[np.ndarray, " shots"]
-    retrievals: Retrievals | None
+    retrievals: Retrieval | None
 
 
 def lidar_of(pulse: Any) -> jl.Lidar:
@@ -207,7 +207,7 @@ def fit_gedi_shots(
         candidates.append(range(len(prepared), len(prepared) + len(starts)))
         prepared += starts
     retrievals = _fit(prepared, path, progress) if prepared else None
-    fit_verdicts = () if retrievals is None else judge_fit(retrievals, about=["ground"])
+    fit_verdicts = [judge_fit(fit, about=["ground"]) for fit in retrievals or ()]
     fits = _empty_fits(len(shots), retrievals)
     verdicts = []
     for i, (shot, numbers) in enumerate(zip(shots, candidates)):
@@ -244,7 +244,7 @@ def _fit(
     prepared: list[PreparedShot],
     path: str | os.PathLike[str] | None,
     progress: ProgressOption,
-) -> Retrievals:
+) -> Retrieval:
     """Fit prepared shots in one batch."""
     size = max(np.size(p.shot.pulse_time) for p in prepared)
     # One plan of all shots, so that they compile once: for the longest pulse and the largest scene.
@@ -278,7 +278,7 @@ def _padded_pulse(shot: Any, size: int) -> jl.SampledPulse:
     return jl.SampledPulse(time=np.r_[time, later], power=np.r_[power, np.zeros(later.size)])
 
 
-def _empty_fits(shots: int, retrievals: Retrievals | None) -> GediFits:
+def _empty_fits(shots: int, retrievals: Retrieval | None) -> GediFits:
     """Return fits of shots that have none."""
     shapes = dict.fromkeys(ESTIMATES, (shots,)) | dict.fromkeys(LAYER_ESTIMATES, (shots, LAYERS))
     samples = (shots, _ABOVE + _BELOW + 1)
@@ -294,7 +294,7 @@ def _empty_fits(shots: int, retrievals: Retrievals | None) -> GediFits:
     )
 
 
-def _store(fits: GediFits, i: int, prepared: PreparedShot, retrievals: Retrievals, number: int) -> None:
+def _store(fits: GediFits, i: int, prepared: PreparedShot, retrievals: Retrieval, number: int) -> None:
     """Write the estimates of shot `i`, those of a fit by its number in `retrievals`, into `fits`."""
     values = {name: np.asarray(value[number], float) for name, value in retrievals.values.items()}
     stderr = {name: np.asarray(error[number], float) for name, error in retrievals.robust_stderr.items()}

@@ -112,7 +112,7 @@ class Recorder(eqx.Module):
     ) -> Float[np.ndarray, "... bins"]:
         """Return the record of a simulated waveform at fitted values.
 
-        **Arguments:** `reflectance`: (..., bins), such as one of `Retrievals.fitted`. `values`: by name, as
+        **Arguments:** `reflectance`: (..., bins), such as one of `Retrieval.fitted`. `values`: by name, as
         fitted; those of the scene are not used. `step`: the sampling interval, ns. Default 1.
 
         **Returns:** (..., bins) in the unit of the record.

@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 import jaxlidar as jl
-from inversion.fit.result import Retrievals
+from inversion.fit.result import Retrieval
 from inversion.fit.uncertainty import correlation_of
 
 LAYERS = 10
@@ -87,7 +87,7 @@ class LayeredCanopy:
             ground=jl.Ground(height=ground, reflectance=GROUND, slope=slope),
         )
 
-    def estimates(self, retrievals: Retrievals, number: int) -> CanopyEstimates:
+    def estimates(self, retrievals: Retrieval, number: int) -> CanopyEstimates:
         """Return what a fit of `inversion.retrieve_many`, by its number, says of the canopy.
 
         The unknowns are named "ground", "canopy height" and "log density". Errors of sums of unknowns are
@@ -126,10 +126,10 @@ def _top_error(
     return 0.5 * thickness * number_of_layers
 
 
-def _robust_covariance(retrievals: Retrievals, number: int) -> Float[np.ndarray, "n n"]:
+def _robust_covariance(retrievals: Retrieval, number: int) -> Float[np.ndarray, "n n"]:
     """Return a covariance with the robust standard errors and the correlations of a fit."""
     stderr = np.concatenate([np.ravel(error[number]) for error in retrievals.robust_stderr.values()])
-    return correlation_of(retrievals.covariance[number]) * np.outer(stderr, stderr)
+    return correlation_of(np.asarray(retrievals.covariance[number])) * np.outer(stderr, stderr)
 
 
 def _propagated(

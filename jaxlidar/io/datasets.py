@@ -7,7 +7,8 @@ The annotations of a class decide what becomes of its fields:
 | array of shape "wavelengths bins" | a variable with these dimensions, or as a `ResultLayout` renames them |
 | array of shape "*shots bins" | the same, with the dimension "shots" for results that have that axis |
 | dict of such arrays | one variable with one more dimension, the first, whose coordinate has the keys |
-| dict of arrays of any shape, "..." | a variable "FIELD.NUMBER.KEY" for each, with the attribute `item` |
+| dict of arrays of any shape, "..." | a variable "FIELD.NUMBER.KEY" for each, with the attribute `item`; its
+first dimension is the leading axis of results that have one |
 | static field | an attribute, as JSON; a tuple of texts is a coordinate |
 | array or dict that is `NotKept` | the attribute null |
 | `Scene` or `Lidar` | an attribute, as TOML of a `Case`; its long arrays in the group "FIELD_arrays" |
@@ -199,7 +200,7 @@ def datasets_of(result: Any, group: str = "/") -> dict[str, Any]:
         inner_group = f"{group.rstrip('/')}/{name}"
         if field.metadata.get("static"):
             builder.add_static(name, value)
-        elif isinstance(value, NotKept):
+        elif value is None or isinstance(value, NotKept):
             builder.add_static(name, None)
         elif (dimensions := _array_dimensions(field.type)) is not None:
             builder.add_array(name, name, dimensions, value)
@@ -211,8 +212,6 @@ def datasets_of(result: Any, group: str = "/") -> dict[str, Any]:
             builder.attributes |= attributes
         elif type(value).__name__ in LAYOUTS:
             inner_datasets |= datasets_of(value, inner_group)
-        elif value is None:
-            builder.add_static(name, value)
         else:
             raise TypeError(f"{name} is of the class {type(value).__name__}, which no file can hold")
     dataset = xarray.Dataset(builder.variables, attrs=builder.attributes).set_coords(list(layout.coordinates))
@@ -286,6 +285,8 @@ class _DatasetBuilder:
         """Names of all dimensions of a variable, from those of its annotation."""
         if not self._has_leading_axis:
             annotated = [d for d in annotated if not d.startswith("*")]
+        elif annotated[:1] == ["..."]:
+            annotated = [f"*{self.layout.rows}", *annotated]
         plain = [d.removeprefix("*") for d in annotated]
         named = [self.layout.dimensions.get(d, d) for d in plain if d != "..."]
         if "..." in annotated:
@@ -343,8 +344,6 @@ class _GroupReader:
 
     def _field(self, layout: ResultLayout, field: Any) -> Any:
         name, annotation = field.name, field.type
-        rows = None if layout.rows is None else layout.dimensions.get(layout.rows, layout.rows)
-        has_rows = name in self.dataset.variables and rows in self.dataset.variables[name].dims
         if field.metadata.get("static"):
             return self._static(name, annotation)
         if (
@@ -354,21 +353,21 @@ class _GroupReader:
         ):
             return NotKept(name)
         if _array_dimensions(annotation) is not None:
-            return self._array(name, annotation, has_rows)
+            return self._array(name, annotation, layout)
         if (item_annotation := _item_annotation(annotation)) is not None:
             if "..." in (_array_dimensions(item_annotation) or []):
-                return self._arrays_of_any_shape(name, item_annotation)
+                return self._arrays_of_any_shape(name, item_annotation, layout)
             keys = self._texts(layout.items_of(name))
-            arrays = self._array(name, item_annotation, has_rows)
+            arrays = self._array(name, item_annotation, layout)
             if len(arrays) != len(keys):
                 raise ValueError(f"{self._place(name)}: {len(arrays)} rows for {len(keys)} names")
             if isinstance(arrays, StoredArray):
                 return {key: arrays.of_item(item) for item, key in enumerate(keys)}
             return dict(zip(keys, arrays))
+        if self.dataset.attrs.get(name) == "null":
+            return None
         if annotation in _CASE_FIELDS:
             return getattr(self.case(name), _CASE_FIELDS[annotation])
-        if name in self.dataset.attrs and self._static(name, annotation) is None:
-            return None
         return result_of(self.stored, f"{self.group.rstrip('/')}/{name}")
 
     def case(self, name: str) -> Case:
@@ -403,10 +402,10 @@ class _GroupReader:
         with refuse_damage(f"{self._place(name)}: damaged"):
             return [str(text) for text in self.stored.values(self.group, name)]
 
-    def _arrays_of_any_shape(self, field: str, annotation: Any) -> dict[str, Any]:
+    def _arrays_of_any_shape(self, field: str, annotation: Any, layout: ResultLayout) -> dict[str, Any]:
         with refuse_damage(f"{self._place(field)}: damaged"):
             variables = variables_by_item(self.dataset, field)
-        return {item: self._array(name, annotation, False) for item, name in variables.items()}
+        return {item: self._array(name, annotation, layout) for item, name in variables.items()}
 
     def _numbers(self, name: str, has_rows: bool = False) -> Any:
         if name not in self.dataset.variables:
@@ -415,7 +414,9 @@ class _GroupReader:
             read = self.stored.rows if has_rows else self.stored.values
             return read(self.group, name)
 
-    def _array(self, name: str, annotation: Any, has_rows: bool) -> Any:
+    def _array(self, name: str, annotation: Any, layout: ResultLayout) -> Any:
+        rows = None if layout.rows is None else layout.dimensions.get(layout.rows, layout.rows)
+        has_rows = name in self.dataset.variables and rows in self.dataset.variables[name].dims
         array = self._numbers(name, has_rows)
         if annotation.dtype is Bool:
             # netCDF has no such type: bytes stand for it.

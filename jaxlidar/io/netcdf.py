@@ -49,7 +49,7 @@ def save(result: Any, path: str | os.PathLike[str], case: Case | None = None) ->
     **Arguments:**
 
     - `result`: a `Waveform`, or an object of any other class that `keep_as_netcdf` registered, such as
-      `inversion.Retrieval` and `inversion.Retrievals`.
+      `inversion.Retrieval`.
     - `path`: the file to write, or the folder of a Zarr store, whose name ends in ".zarr". Missing folders
       are created.
     - `case`: the `Case` from which a waveform, or those of a survey, were simulated. It is written with them

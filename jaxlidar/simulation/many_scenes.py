@@ -74,7 +74,7 @@ def simulate_scenes(
     >>> waves.reflectance.shape[:2], f"{float(waves[99].reflectance.sum()):.2f}"
     ((100, 1), '0.50')
     >>> print(waves)
-    100 waveforms of 44 samples of 1 ns from -28 ns, at 1064 nm
+    100 waveforms of 43 samples of 1 ns from -21 ns, at 1064 nm
     """
     check_kinds(lidar, scenes)
     check_key(key)

@@ -46,16 +46,16 @@ def fit(wave, case):
         at_bound={name: v > 0.5 for name, v in values.items()},
         simulation_error=values,
         covariance=jax.numpy.asarray(rng.random((n, n))),
-        correlation=jax.numpy.eye(n),
         scene=case.scene,
         waveform=wave,
         residuals=wave.reflectance,
+        fitted=wave.reflectance,
         reduced_chi2=jax.numpy.asarray(1.1),
         second_minimum=jax.numpy.asarray(np.inf),
         independent_samples=jax.numpy.asarray(12.5),
         averaging=jax.numpy.asarray(rng.random((n, n))),
         strength={"scene/leaf": jax.numpy.asarray(0.7)},
-        bounds={name: jax.numpy.stack([v, v + 1.0]) for name, v in values.items()},
+        bounds={name: np.stack([v, v + 1.0]) for name, v in values.items()},
         converged=True,
         status="converged: it ended at a minimum",
         steps=7,
@@ -67,7 +67,7 @@ def fit(wave, case):
 @pytest.fixture(scope="module")
 def fits():
     rng = np.random.default_rng(1)
-    return inversion.Retrievals(
+    return inversion.Retrieval(
         values={"Cab": rng.random(5), "layers": rng.random((5, 3))},
         stderr={"Cab": rng.random(5), "layers": rng.random((5, 3))},
         robust_stderr={"Cab": rng.random(5), "layers": rng.random((5, 3))},
@@ -82,6 +82,8 @@ def fits():
         bounds={"Cab": rng.random(2), "layers": rng.random((2, 3))},
         converged=np.array([True, False, True, True, False]),
         steps=np.arange(5),
+        simulation_error={"Cab": rng.random(5), "layers": rng.random((5, 3))},
+        residuals=rng.random((5, 2, 7)),
         fitted=rng.random((5, 2, 7)),
         status=("done", "ü", "", "failed: no photon", "done"),
         labels=("Cab", "layers[0]", "layers[1]", "layers[2]"),

@@ -138,15 +138,16 @@ def test_a_waveform_and_the_fitted_scene():
 def test_within_programs():
     scene, key = jl.Scene(ground=jl.Ground(slope=5.0)), jax.random.key(1)
 
-    def fit(record):
-        unknowns, more = [HEIGHT, REFLECTANCE], {"noise": 0.002, "time": TIME, "key": key}
+    def fit(record, **options):
+        unknowns, more = [HEIGHT, REFLECTANCE], {"noise": 0.002, "time": TIME, "key": key, **options}
         return ask(inversion.retrieve, record, lidar_of_program, scene, unknowns, **more)
 
     lidar_of_program = lidar_of()
     alone, within = fit(RECORD), jax.jit(fit)(RECORD)
     for a, b in zip(jax.tree.leaves(alone), jax.tree.leaves(within), strict=True):
         np.testing.assert_array_equal(a, b)
-    assert not within.converged
+    assert within.converged
+    assert not jax.jit(lambda record: fit(record, max_steps=1))(RECORD).converged
     assert "program" in within.status
 
     def height(record):

@@ -98,6 +98,36 @@ def test_every_footprint_is_retrieved_within_its_errors(footprints):
     assert fits.labels == ("height", "reflectance[0]", "reflectance[1]")
 
 
+def test_the_result_has_an_axis_of_footprints_in_memory_and_in_files(footprints, tmp_path):
+    observed, noise, time = footprints
+    fits = fit((observed[:3], noise, time))
+    assert isinstance(fits, inversion.Retrieval)
+    assert len(fits) == len(list(fits)) == len(fits.quality) == 3
+    assert fits.correlation.shape == (3, 3, 3)
+    assert fits.residuals.shape == (3, *observed[0].shape)
+    chi2 = np.sum(fits.residuals**2, axis=(1, 2)) / (observed[0].size - 3)
+    np.testing.assert_allclose(chi2, fits.reduced_chi2, rtol=1e-6)
+    one = fits[1]
+    assert (one.status, one.labels, one.quality) == (fits.status[1], fits.labels, fits.quality[1])
+    assert one.values["reflectance"].tolist() == fits.values["reflectance"][1].tolist()
+    np.testing.assert_array_equal(one.correlation, fits.correlation[1])
+    np.testing.assert_array_equal(one.band("height")[0], fits.band("height")[0][1])
+    assert str(one).startswith("height ")
+    assert str(fits) == "3 fits of height, reflectance: 3 converged"
+    assert (one.scene, one.waveform) == (None, None)
+    with pytest.raises(IndexError, match="footprint 3: there are 3"):
+        fits[3]
+    for refused in (len, iter, lambda fit: fit[0], lambda fit: fit.to_xarray()):
+        with pytest.raises(TypeError, match="no axis of footprints"):
+            refused(one)
+    for name in ("fits.nc", "fits.zarr"):
+        for result in (fits, one):
+            jl.io.save(result, tmp_path / name)
+            stored = jl.open(tmp_path / name)
+            assert jax.tree.structure(stored) == jax.tree.structure(result)
+            jax.tree.map(np.testing.assert_array_equal, stored, result)
+
+
 def test_many_fits_are_the_single_fits(footprints):
     observed, noise, time = footprints
     fits = fit(footprints)

@@ -42,6 +42,8 @@ def test_fits_are_read_as_they_were_written(tmp_path):
             converged=number > 0,
             status="converged after 4 simulations; the data do not determine λ"[number:],
             steps=4,
+            simulation_error=np.array([0.01, 0.0]),
+            residuals=np.linspace(-2.0, 2.0, 30)[None],
             fitted=np.linspace(0.0, 1.0, 30)[None],
         )
 

@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from inversion.fit.result import Retrievals
+from inversion.fit.result import Retrieval
 from inversion.scene import layered_canopy
 from inversion.scene.layered_canopy import LAYERS, LayeredCanopy
 
@@ -22,7 +22,7 @@ def fits_of(values, covariance, widening):
 
     n, no_names, pair = len(covariance), {}, np.ones(2)
     robust = {name: widening * a for name, a in errors.items()}
-    return Retrievals(
+    return Retrieval(
         values=both(values, 0.5),
         stderr=both(errors, 3.0),
         robust_stderr=both(robust, 3.0),
@@ -37,6 +37,8 @@ def fits_of(values, covariance, widening):
         bounds=no_names,
         converged=pair > 0,
         steps=np.ones(2, int),
+        simulation_error=no_names,
+        residuals=np.zeros((2, 1, 1)),
         fitted=np.zeros((2, 1, 1)),
         status=("", ""),
         labels=("",) * n,
