@@ -88,7 +88,12 @@ def bins_and_samples(
         # far from the first sample, so that programs are the same.
         first = min(first, begin - pulse_start)
     lead = math.ceil((edge - first) / width) + 3
-    count = lead + math.ceil((last - edge) / width) + 3
+    after = math.ceil((last - edge) / width) + 3
+    if window is not None:
+        # An eighth more at most, so that a shift of the window by a little keeps the programs.
+        step = max((1 << max(lead + after, 1).bit_length()) // 16, 1)
+        lead = -(-lead // step) * step
+    count = lead + after
     start = edge + width * (0.5 - lead)
     bins = TimeBins(start, width, max(count, 1), max_span=KERNEL_BINS)
     return bins, SampleTimes(begin, interval, samples, bins_per_sample)
