@@ -1,10 +1,10 @@
-"""Text of a printed waveform."""
+"""Light that a waveform lacks, and the text of a printed waveform."""
 
 from typing import Any
 
 import numpy as np
 
-# Light that a record misses is reported from this fraction of the emitted light on.
+# Light that a record misses is reported from this fraction of the returned light on.
 NOTABLE_FRACTION = 0.01
 
 
@@ -14,15 +14,38 @@ def percent(fraction: float) -> str:
     return f"{float(f'{100 * fraction:.2g}'):g} %"
 
 
-def outside_fraction(wave: Any) -> float:
-    """Return the largest fraction, of all wavelengths, of light that is in flight when the record ends."""
-    return float(np.max(np.asarray(wave.energy_budget["after the window"]), initial=0.0))
+def unfollowed_return(unfollowed: Any, escaped: Any, returned: Any) -> Any:
+    """Return the apparent reflectance that light beyond the last order may add.
+
+    It is taken to return as much per energy as the light that escaped, but an apparent reflectance of 1 per
+    unit of energy at least, and 4 at most. `unfollowed`, `escaped`: energies. `returned`: reflectance.
+    """
+    return unfollowed * (returned / escaped.clip(1e-6)).clip(1.0, 4.0)
 
 
-def truncated_fraction(wave: Any) -> float:
-    """Return the largest bound, of all wavelengths, on what untraced orders may add to the waveform."""
-    total = np.asarray(wave.reflectance).sum(axis=1)
-    return float(np.max(np.asarray(wave.neglected) / np.maximum(total, 1e-30), initial=0.0))
+def neglected_fractions(wave: Any) -> tuple[float, float]:
+    """Return how much light may return of orders beyond the last, and after the record.
+
+    They are the largest fractions, of all wavelengths: the first of the light in the record, the second of
+    this and what returns later. `Waveform.neglected` has the sum of both.
+    """
+    budget = {name: np.asarray(energy) for name, energy in wave.energy_budget.items()}
+    total = np.maximum(np.asarray(wave.reflectance).sum(axis=-1), 1e-30)
+    unfollowed = neglected = np.asarray(wave.neglected)
+    if np.any(budget["after the window"]):
+        unfollowed = unfollowed_return(budget["unfollowed"], budget["escaped"], total)
+        unfollowed = np.minimum(neglected, unfollowed)
+    outside = neglected - unfollowed
+    fractions = unfollowed / total, outside / (total + outside)
+    return float(np.max(fractions[0], initial=0.0)), float(np.max(fractions[1], initial=0.0))
+
+
+def outside_message(fraction: float, end: float, advice: str) -> str:
+    """Return the text of the warning that a fraction of the returned light comes after `end`, ns."""
+    return (
+        f"some {percent(fraction)} of the returned light is still on its way when the record ends at "
+        f"{end:.4g} ns: {advice}"
+    )
 
 
 def unfollowed_message(orders: int, fraction: float) -> str:
@@ -61,12 +84,11 @@ def summary(wave: Any) -> str:
         title,
         *(f"  {name.ljust(width)}  " + "  ".join(c.rjust(8) for c in cells) for name, cells in rows.items()),
     ]
-    if outside_fraction(wave) >= NOTABLE_FRACTION:
-        lines.append(
-            f"  {percent(outside_fraction(wave))} of the light is still on its way when the record ends"
-        )
-    if truncated_fraction(wave) >= NOTABLE_FRACTION:
-        lines.append(f"  orders beyond the last may add {percent(truncated_fraction(wave))}")
+    unfollowed, outside = neglected_fractions(wave)
+    if outside >= NOTABLE_FRACTION:
+        lines.append(f"  {percent(outside)} of the returned light is still on its way when the record ends")
+    if unfollowed >= NOTABLE_FRACTION:
+        lines.append(f"  orders beyond the last may add {percent(unfollowed)}")
     info = wave.info
     if info:
         lines.append(

@@ -18,7 +18,7 @@ from jaxlidar._fields.checks import warn_user
 KEY = jax.random.key(5)
 LIDAR = jl.Lidar()
 # Light goes to and fro between the plate and the ground when the record ends.
-BRIGHT = jl.Scene(plates=(jl.Plate(80.0, 0.4, 0.5),), ground=jl.Ground(reflectance=0.9))
+BRIGHT = jl.Scene(plates=(jl.Plate(800.0, 0.4, 0.5),), ground=jl.Ground(reflectance=0.9))
 
 
 def line_of_warning(call, category):
@@ -41,7 +41,7 @@ def test_a_survey():
     survey = jl.Survey(LIDAR, np.zeros((2, 2)))
 
     def call():
-        jl.simulate_many(survey, BRIGHT, key=KEY, rtol=0.2, max_orders=4)
+        jl.simulate_many(survey, BRIGHT, key=KEY, rtol=0.1, max_orders=4)
 
     assert "jl.simulate_many(" in line_of_warning(call, jl.LateLightWarning)
 

@@ -263,7 +263,7 @@ WAVEFORM_QUANTITIES = {
     "energy": ("J", "energy that the detector registers per sample"),
     "stderr": ("1", "standard error of the apparent reflectance"),
     "components": ("1", "apparent reflectance per sample by material and by order of scattering"),
-    "neglected": ("1", "apparent reflectance that orders beyond the last could add"),
+    "neglected": ("1", "apparent reflectance of light that was not followed, or comes after the record"),
     "energy_budget": ("1", "share of the emitted energy by fate, before the atmosphere"),
     "energy_budget_stderr": ("1", "standard error of the share of the emitted energy"),
     "lost": ("1", "apparent reflectance that arrives before or after all fine bins of the plan"),

@@ -26,6 +26,7 @@ from jaxlidar.planning.effects import allows_interreflection
 from jaxlidar.planning.size_buckets import size_bucket
 from jaxlidar.scenes.canopy import Canopy
 from jaxlidar.scenes.scene import Scene
+from jaxlidar.scenes.terrain import Terrain
 
 # Orders are followed while their histories are not more than this (16 orders of four channels, 29 of three).
 MAX_HISTORIES = 5000
@@ -38,13 +39,18 @@ MAX_ORDERS = 1000
 MAX_BUCKETED_HISTORIES = 7000
 # The recollision probability p is taken to be at least this.
 MIN_RECOLLISION = 0.8
-# Multiple scattering is recorded this long after the last first-order return, ns, at least and at most.
+# Multiple scattering is recorded this long after the last first-order return, ns, at least; at most, where
+# little light is left by then.
 TAIL = (10.0, 300.0)
-# It may be longer, up to this, where the ratio of successive orders is larger than this: light lingers in
-# dense canopies that absorb little.
+# It may be longer, up to this, where the tolerance asks for it, or where the ratio of successive orders is
+# larger than this: light lingers in dense canopies that absorb little.
 LONG_TAIL, LINGERING = 3000.0, 0.9
-# The record ends when the estimated fraction of light that is still in the scene falls below this.
+# The record ends when the estimated fraction of light that is still in the scene falls below this, or below
+# this share of a smaller tolerance.
 LATE_FRACTION = 0.003
+LATE_SHARE = 0.3
+# Share of the tolerance that may return later of light that grazes the ground far from an open canopy.
+GRAZING_SHARE = 0.5
 
 
 class OrderChoice(NamedTuple):
@@ -222,25 +228,70 @@ def orders_to_tolerance(fraction: float, rtol: float) -> int:
 
 
 def multiple_scattering_tail(
-    scene: Scene, optics: list[MaterialOptics], first_return: float, last_return: float
+    scene: Scene,
+    optics: list[MaterialOptics],
+    first_return: float,
+    last_return: float,
+    rtol: float,
+    n_histories: int,
 ) -> float:
     """Estimate for how long, ns, after the last first-order return multiple scattering is worth recording.
 
-    From one scattering to the next light takes the time of a mean free path in the canopy, or of the height
-    between first and last return. The light that is still in the scene falls by the factor q each time. The
-    tail is at least three times as long as order one lasts, but no more than 60 ns of that, and 10 to 300 ns
-    long in all.
+    1. From one scattering to the next light takes the time of a mean free path in the canopy, or of the
+       height between first and last return. The light that is still in the scene falls by the factor q each
+       time. In a canopy that is an upper bound, so that tails are made longer than 300 ns for what exceeds
+       the tolerance only.
+    2. Light that grazes the ground returns late, however fast the decay: see `grazing_tail`.
+    3. The tail is at least three times as long as order one lasts, but no more than 60 ns of that, and 10 to
+       3000 ns long in all. Memory is proportional to the length and to the number of histories
+       `n_histories`: with as many as `MAX_HISTORIES`, it is 300 ns at most unless light lingers.
     """
     usual_tail = min(max(3 * (last_return - first_return), TAIL[0]), 60.0)
     fraction = scattered_again(scene, optics)
     time_between = 0.5 * (last_return - first_return)
     if scene.canopy is not None:
         depth = mean_optical_depth(scene.canopy)
-        size, shape = concrete_array(scene.canopy.voxels.voxel_size), scene.canopy.voxels.shape
-        height = float(size[2]) * shape[2]
+        height = _canopy_size(scene.canopy)[2]
         time_between = height / max(depth, 0.5) / SPEED_OF_LIGHT if math.isfinite(depth) else time_between
     longest = LONG_TAIL if LINGERING < slowest_decay(scene, optics) < 1 else TAIL[1]
     if fraction >= 1:
         return longest
-    scatterings = math.log(LATE_FRACTION) / math.log(max(fraction, 1e-6))
-    return min(max(usual_tail, scatterings * time_between), longest)
+
+    def decay_time(remainder: float) -> float:
+        return math.log(remainder) / math.log(max(fraction, 1e-6)) * time_between
+
+    tail = min(max(usual_tail, decay_time(min(LATE_FRACTION, LATE_SHARE * rtol))), longest)
+    required = max(decay_time(rtol), grazing_tail(scene, optics, last_return - first_return, rtol))
+    return max(tail, min(required, max(TAIL[1] * MAX_HISTORIES / n_histories, TAIL[1]), LONG_TAIL))
+
+
+def grazing_tail(scene: Scene, optics: list[MaterialOptics], duration: float, rtol: float) -> float:
+    """Estimate after which time, ns, little light returns that leaves an open canopy and grazes the ground.
+
+    Let leaves scatter the light S isotropically, at the height h above ground of reflectance r. The fraction
+    h / (2 d) of it flies down so flat that it meets the ground beyond the distance d, unless the canopy stops
+    it: the fraction p = exp(-k a) leaves a canopy of extinction k and half width a by its sides. It adds
+    r S p h / (2 d) to the apparent reflectance, while the leaves return S / 4 and the ground r S / 2. So the
+    fraction that returns later than d / c,
+
+        2 r / (1 + 2 r) p h / d,
+
+    falls with the inverse of time alone. `duration` is that of order one, ns, from the top to the ground.
+    """
+    if scene.canopy is None or scene.ground is None or scene.canopy.sides != "open":
+        return 0.0
+    reflectance = _largest_reflectance(optics, "ground")
+    width, depth = _canopy_size(scene.canopy), mean_optical_depth(scene.canopy)
+    half_width, height = 0.25 * (width[0] + width[1]), 0.5 * SPEED_OF_LIGHT * duration
+    leaves_sides = math.exp(-depth / width[2] * half_width)
+    distance = 2 * reflectance / (1 + 2 * reflectance) * leaves_sides * height / (GRAZING_SHARE * rtol)
+    if isinstance(scene.ground, Terrain) and scene.ground.sides == "open":
+        # There is no ground beyond.
+        shape = np.asarray(scene.ground.heights.shape) - 1
+        distance = min(distance, float(np.linalg.norm(concrete_array(scene.ground.spacing) * shape)))
+    return distance / SPEED_OF_LIGHT
+
+
+def _canopy_size(canopy: Canopy) -> tuple[float, ...]:
+    """Return the sizes of the voxel map along x, y and z, m."""
+    return tuple((concrete_array(canopy.voxels.voxel_size) * np.asarray(canopy.voxels.shape)).tolist())

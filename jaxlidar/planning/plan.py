@@ -208,6 +208,11 @@ class Plan(eqx.Module):
         return self.config.photons_traced
 
     @property
+    def record_end(self) -> float:
+        """Time of the end of the last sample, ns."""
+        return self.sample_start + self.sample_interval * self.n_samples
+
+    @property
     def is_random(self) -> bool:
         """True if anything is drawn at random."""
         return self.config.is_random
@@ -278,8 +283,8 @@ def plan(
     - `lidar`: a `Lidar`; or a `Survey`: the plan then serves all of its shots; its table is that of a shot
       in their middle with the largest zenith.
     - `scene`: a `Scene`.
-    - `rtol`: relative accuracy aimed at, in (0, 1); sets how many orders are worth following. Default None:
-      0.01.
+    - `rtol`: relative accuracy aimed at, in (0, 1); sets how many orders are worth following, and for how
+      long. Default None: 0.01.
     - `max_orders`: follow exactly this many scatterings, whatever `rtol` needs; at least 1. Default None:
       from `rtol` and the optics; with histories, as many as their table has room for (some 16 to 29).
     - `max_step`: longest segment, m, of a footprint ray that order one deposits at once; positive. The result
@@ -289,8 +294,8 @@ def plan(
       quadrature rule takes their place. Default None: 4096 with one order or a fixed footprint; else 2048
       where the pulse's standard deviation, with its jitter, is below a sampling interval; else 1024.
     - `window`: (first, last) sample time, ns. Default None: covers the scene, and multiple scattering until
-      little of it is left, or 300 ns at most (3000 ns in dense canopies that absorb
-      little).
+      what returns later is likely to be below `rtol`, for 3000 ns at most; for 300 ns at most where
+      thousands of histories must be kept (many orders and more than 8 wavelengths).
     - `bin_width`: width of the fine bins, ns, positive; reduced to a whole fraction of the sampling interval.
       Default None: a quarter of the pulse's finest feature with its jitter, between 0.05 and 1 sampling
       intervals; half an interval for a pulse without duration.
@@ -392,7 +397,12 @@ def plan(
     pulse_std = math.hypot(concrete_number(lidar.pulse.std), jitter)
     first_return = path_lengths.first_path / SPEED_OF_LIGHT
     last_return = path_lengths.last_path / SPEED_OF_LIGHT
-    tail = multiple_scattering_tail(scene, optics, first_return, last_return) if orders > 1 else 0.0
+    n_histories = 1
+    if histories or wavelengths > MAX_APPLIED_WAVELENGTHS:
+        n_histories = math.comb(max_degree(steps, n_plates) + n_channels, n_channels)
+    tail = 0.0
+    if orders > 1:
+        tail = multiple_scattering_tail(scene, optics, first_return, last_return, rtol, n_histories)
     target_width = target_bin_width(interval, pulse_feature, pulse_std, bin_width)
     bins, samples = bins_and_samples(lidar, scene, path_lengths, tail, window, target_width)
     bins_with_air = extend_to_air_return(bins, lidar, samples)

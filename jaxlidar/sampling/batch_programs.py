@@ -45,20 +45,20 @@ class BatchEstimate(NamedTuple):
     - `samples`: apparent reflectance, in rows of wavelengths or of pivots (see
       `jaxlidar.spectral.apply_optics.samples_and_budget`).
     - `budget_names`, `budget`: terms of the energy budget, fractions of the pulse's energy.
-    - `neglected`: apparent reflectance that orders beyond the last may add.
+    - `unfollowed`: apparent reflectance that orders beyond the last may add.
     """
 
     samples: Float[Array, "rows samples"]
     budget_names: tuple[str, ...]
     budget: Float[Array, "terms wavelengths"]
-    neglected: Float[Array, "wavelengths"]
+    unfollowed: Float[Array, "wavelengths"]
 
 
 def _estimate(response: Response, model: WaveformModel) -> BatchEstimate:
     samples, terms = samples_and_budget(response, model)
     # In the order in which JAX keeps the dict itself.
     names = tuple(sorted(terms.energy_budget))
-    return BatchEstimate(samples, names, jnp.stack([terms.energy_budget[n] for n in names]), terms.neglected)
+    return BatchEstimate(samples, names, jnp.stack([terms.energy_budget[n] for n in names]), terms.unfollowed)
 
 
 def _add(a: Any, b: Any) -> Any:

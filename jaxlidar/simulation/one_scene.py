@@ -24,7 +24,7 @@ from jaxlidar._fields.checks import (
 )
 from jaxlidar._jax.mesh_axes import vary_with, with_automatic_axes
 from jaxlidar._jax.threads import side_by_side
-from jaxlidar._summary import NOTABLE_FRACTION, outside_fraction, percent, unfollowed_message
+from jaxlidar._summary import neglected_fractions, outside_message, percent, unfollowed_message
 from jaxlidar.planning.memory import MAX_APPLIED_WAVELENGTHS
 from jaxlidar.planning.orders import MAX_ORDERS, orders_to_tolerance
 from jaxlidar.planning.plan import MIN_BATCHES, Plan
@@ -85,7 +85,7 @@ def simulate(
     over the samples above 1 % of the peak, of standard error over reflectance, for the worst wavelength.
     Where nothing is random (one order, over planes alone or with a fixed footprint), one pass is made.
     Standard errors are widened for few batches, by Student's t, so that the expected value lies within two of
-    them in 95 % of cases. Neglected orders (`Waveform.neglected`) and rounding come on top.
+    them in 95 % of cases. Neglected light (`Waveform.neglected`) and rounding come on top.
 
     Within a JAX transformation (grad, jacfwd, vmap over scenes) eight batches are traced, whatever the error.
     Where geometry is transformed, the plan must be made outside and passed as `plan`.
@@ -152,7 +152,7 @@ def simulate(
     tracer = make_batch_tracer(make_setup(lidar, scene, plan), key)
     result = _run_batches(tracer, key, goal, progress, start_time)
     while result.needs_more_orders and given_plan is None:
-        more_orders = _more_orders(plan, lidar.wavelength.size, result.neglected_fraction, goal)
+        more_orders = _more_orders(plan, lidar.wavelength.size, result.unfollowed_fraction, goal)
         if more_orders is None or time.perf_counter() - start_time >= max_seconds:
             break
         plan = _check_or_make_plan(lidar, scene, None, goal, planning | more_orders, is_transformed)
@@ -231,7 +231,7 @@ def _check_or_make_plan(
 
 
 def _more_orders(
-    plan: Plan, wavelengths: int, neglected_fraction: float, goal: _Goal
+    plan: Plan, wavelengths: int, unfollowed_fraction: float, goal: _Goal
 ) -> dict[str, Any] | None:
     """Return the planning arguments of a simulation that follows more orders, or None where none can.
 
@@ -243,15 +243,15 @@ def _more_orders(
     if wavelengths > MAX_APPLIED_WAVELENGTHS or plan.orders >= MAX_ORDERS:
         return None
     # The first orders may fall faster than later ones, so that the mean ratio of orders is a lower bound.
-    ratio = max(plan.likely_beyond, neglected_fraction) ** (1.0 / plan.orders)
-    orders = plan.orders + orders_to_tolerance(ratio, goal.tolerance(plan) / neglected_fraction)
+    ratio = max(plan.likely_beyond, unfollowed_fraction) ** (1.0 / plan.orders)
+    orders = plan.orders + orders_to_tolerance(ratio, goal.tolerance(plan) / unfollowed_fraction)
     return {"max_orders": min(orders, MAX_ORDERS), "histories": False}
 
 
 class _BatchResults(NamedTuple):
     """The sum of the responses of some batches, standard errors, and `info`.
 
-    Standard errors are None where nothing is random. `neglected_fraction`: fraction that orders beyond the
+    Standard errors are None where nothing is random. `unfollowed_fraction`: fraction that orders beyond the
     last may add. `needs_more_orders`: True if nothing else was short of the goal.
     """
 
@@ -260,7 +260,7 @@ class _BatchResults(NamedTuple):
     stderr: Array | None
     energy_budget_stderr: dict[str, Array] | None
     info: dict[str, Any]
-    neglected_fraction: float = 0.0
+    unfollowed_fraction: float = 0.0
     needs_more_orders: bool = False
 
 
@@ -306,15 +306,12 @@ def _make_waveform(tracer: BatchTracer, result: _BatchResults, goal: _Goal) -> W
     wave = dataclasses.replace(
         wave, info={**result.info, "altitude": None if lidar.altitude is None else float(lidar.altitude)}
     )
-    if plan.scope.automatic_window and outside_fraction(wave) >= NOTABLE_FRACTION:
-        end = plan.sample_start + plan.sample_interval * plan.n_samples
-        warn_user(
-            f"{percent(outside_fraction(wave))} of the light is still on its way when the record ends at "
-            f"{end:.4g} ns: give window=, or see Waveform.energy_budget",
-            LateLightWarning,
-        )
-    if result.neglected_fraction > goal.tolerance(plan):
-        warn_user(unfollowed_message(plan.orders, result.neglected_fraction), UnfollowedLightWarning)
+    outside = neglected_fractions(wave)[1]
+    if plan.scope.automatic_window and outside > goal.tolerance(plan):
+        message = outside_message(outside, plan.record_end, "give window=, or see Waveform.neglected")
+        warn_user(message, LateLightWarning)
+    if result.unfollowed_fraction > goal.tolerance(plan):
+        warn_user(unfollowed_message(plan.orders, result.unfollowed_fraction), UnfollowedLightWarning)
     return open_at_first_return(wave, lidar) if lidar.opens_at_first_return else wave
 
 
@@ -341,9 +338,10 @@ class UnfollowedLightWarning(UserWarning):
 
 
 class LateLightWarning(UserWarning):
-    """The warning that a record ends while a hundredth of the light or more is still on its way.
+    """The warning that more of the returned light than the tolerance comes after the end of the record.
 
-    It is given where the plan chose the window. A `window=` of your own is taken as it is.
+    It is given where the plan chose the window, which is at most 3000 ns longer than that of order one. A
+    `window=` of your own is taken as it is; an estimate of what it leaves out is in `Waveform.neglected`.
 
     **Example:** light goes to and fro between bright surfaces.
 
@@ -388,8 +386,8 @@ class _WaveformEstimate(AbstractEstimate):
     """Sum of the responses of batches, and the moments from which their standard errors follow.
 
     - `response_sum`: the sum. - `waveforms`: moments of waveforms.
-    - `budgets`: moments of energy budgets, with the mean of the neglected reflectance. - `budget_names`: of
-      their rows.
+    - `budgets`: moments of energy budgets, with the mean reflectance of unfollowed light. - `budget_names`:
+      of their rows.
     """
 
     def __init__(
@@ -415,11 +413,11 @@ class _WaveformEstimate(AbstractEstimate):
             self.response_sum = self.tracer.add(self.response_sum, response)
             # Wavelengths beyond the lidar's are padding.
             budget = np.asarray(batch.budget)[:, : self.n_wavelengths]
-            neglected = np.asarray(batch.neglected)[: self.n_wavelengths]
+            unfollowed = np.asarray(batch.unfollowed)[: self.n_wavelengths]
             if self.budgets is None:
-                self.budgets = RunningMoments.on_host(budget, neglected)
+                self.budgets = RunningMoments.on_host(budget, unfollowed)
                 self.budget_names = batch.budget_names
-            self.budgets = self.budgets.update(budget, neglected)
+            self.budgets = self.budgets.update(budget, unfollowed)
             self.waveforms.add(batch.samples)
 
     def errors(self) -> WaveformErrors:
@@ -468,13 +466,13 @@ def _trace_batches(
             keeps_interrupted=True,
         )
     assert isinstance(errors, WaveformErrors)
-    stopped, neglected = reason.value, estimate.budgets.mean_only
-    neglected_fraction = 0.0
-    if plan.scope.automatic_orders and float(np.max(neglected, initial=0.0)) > goal.atol:
-        neglected_fraction = float(np.max(neglected / np.maximum(errors.total, 1e-30), initial=0.0))
-    needs_more_orders = reason is StopReason.TOLERANCE_MET and neglected_fraction > rtol
+    stopped, unfollowed = reason.value, estimate.budgets.mean_only
+    unfollowed_fraction = 0.0
+    if plan.scope.automatic_orders and float(np.max(unfollowed, initial=0.0)) > goal.atol:
+        unfollowed_fraction = float(np.max(unfollowed / np.maximum(errors.total, 1e-30), initial=0.0))
+    needs_more_orders = reason is StopReason.TOLERANCE_MET and unfollowed_fraction > rtol
     if needs_more_orders:
-        stopped = f"orders beyond {plan.orders} may add {percent(neglected_fraction)}"
+        stopped = f"orders beyond {plan.orders} may add {percent(unfollowed_fraction)}"
     info = {
         "photons": estimate.n_batches * plan.photons_traced,
         "batches": estimate.n_batches,
@@ -488,6 +486,6 @@ def _trace_batches(
         stderr=jnp.asarray(errors.stderr),
         energy_budget_stderr=dict(zip(estimate.budget_names, map(jnp.asarray, estimate.budgets.stderr))),
         info=info,
-        neglected_fraction=neglected_fraction,
+        unfollowed_fraction=unfollowed_fraction,
         needs_more_orders=needs_more_orders,
     )

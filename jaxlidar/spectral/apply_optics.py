@@ -26,6 +26,7 @@ from jaxlidar._constants import SPEED_OF_LIGHT
 from jaxlidar._fields.checks import as_array
 from jaxlidar._jax.products import einsum
 from jaxlidar._jax.programs import Program
+from jaxlidar._summary import unfollowed_return
 from jaxlidar.planning.channels import channel_optics
 from jaxlidar.planning.config import KERNEL_VARIANCE
 from jaxlidar.planning.effects import allows_interreflection
@@ -454,12 +455,19 @@ def component_samples(
 class BudgetTerms(NamedTuple):
     """Fractions of the emitted energy by fate, and light that is not in the record, (wavelengths,) each.
 
-    See `Waveform`.
+    See `Waveform`. Its `neglected` is the apparent reflectance `unfollowed`, of orders beyond the last, and
+    `outside`, of light that is in flight at the end of the record.
     """
 
     energy_budget: dict[str, Float[Array, "wavelengths"]]
-    neglected: Float[Array, "wavelengths"]
+    unfollowed: Float[Array, "wavelengths"]
+    outside: Float[Array, "wavelengths"]
     lost: Float[Array, "wavelengths"]
+
+    @property
+    def neglected(self) -> Float[Array, "wavelengths"]:
+        """Apparent reflectance of all light that was left out, an estimate."""
+        return self.unfollowed + self.outside
 
 
 def budget_excess(
@@ -590,16 +598,22 @@ def budget_of_sums(sums: ResponseSums, model: WaveformModel) -> BudgetTerms:
     source = "unfollowed" if model.one_order and model.can_scatter_again else "escaped"
     returned = jnp.minimum(budget["returned"], budget[source])
     budget = {**budget, "returned": returned, source: budget[source] - returned}
-    # Unfollowed light is taken to return as much per energy as the light that escaped, but an apparent
-    # reflectance of 1 per unit of energy at least, and 4 at most. Where one order is followed no scattered
-    # light has escaped to compare with, and the user left higher orders out: the estimate is zero.
-    return_per_energy = sums.returned / jnp.maximum(budget["escaped"], 1e-6)
-    unfollowed = jnp.zeros_like(sums.returned) if model.one_order else budget["unfollowed"]
+    # Where one order is followed no scattered light has escaped to compare with, and the user left higher
+    # orders out: the estimate is zero.
+    unfollowed = jnp.zeros_like(sums.returned)
+    if not model.one_order:
+        unfollowed = unfollowed_return(budget["unfollowed"], budget["escaped"], sums.returned)
+    # Light in flight has yet to meet the scene. It is taken to return as much per energy as all light that
+    # was followed and, as it may meet the ground where the beam met dark leaves, no less than a panel of the
+    # largest reflectance or transmittance.
+    in_flight, followed_return = budget["after the window"], sums.returned + sums.returned_outside
+    followed = jnp.maximum(1.0 - in_flight - budget["unfollowed"], 1e-6)
+    brightest = jnp.max(model.optics, axis=0, initial=0.0)
+    outside = in_flight * jnp.maximum(followed_return / followed, brightest)
     # What a plan that does not cover the scene leaves out is not known: all light of a white surface, and no
     # less than what was found, as mirrors return more.
-    white = jnp.maximum(sums.returned + sums.returned_outside, 1.0)
-    outside = jnp.where(model.is_covered, sums.returned_outside, white)
-    return BudgetTerms(budget, unfollowed * jnp.clip(return_per_energy, 1.0, 4.0), outside)
+    lost = jnp.where(model.is_covered, sums.returned_outside, jnp.maximum(followed_return, 1.0))
+    return BudgetTerms(budget, unfollowed, outside, lost)
 
 
 def samples_and_budget(

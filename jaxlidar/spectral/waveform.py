@@ -56,10 +56,11 @@ class Waveform(eqx.Module):
       wavelength's largest.
     - `components`: dict of arrays like `reflectance`: by material of the last scattering ("ground", "leaf",
       "bark", "plate", "air"), and by order ("first", "higher").
-    - `neglected`: (wavelengths,) apparent reflectance that orders beyond the last could still add, an
-      estimate. Zero where one order is followed, which says nothing of the others: order one tells nothing
-      about how much of the light that is scattered again returns. The light itself is in
-      `energy_budget["unfollowed"]`, and `jaxlidar.plan` bounds what the orders beyond add.
+    - `neglected`: (wavelengths,) apparent reflectance that orders beyond the last, and light in flight at
+      the end of the record, could still add, an estimate. The light itself is in
+      `energy_budget["unfollowed"]` and `["after the window"]`. Zero where one order is followed, which says
+      nothing of the others: order one tells nothing about how much of the light that is scattered again
+      returns; `jaxlidar.plan` bounds what they add.
     - `energy_budget`: dict of (wavelengths,) fractions of the emitted energy, before the atmosphere:
       "returned" into the aperture, "escaped", "absorbed by ...",
       "after the window", "unfollowed" beyond the last order.
@@ -69,7 +70,8 @@ class Waveform(eqx.Module):
       after all fine bins of the plan, as light does that is scattered many times. Within a JAX
       transformation, where a plan that does not cover the lidar and the scene cannot be refused, it is 1 at
       least for these: the waveform is then wrong, as rays may start below a surface. Light that is still in
-      the scene at the end of the record is "after the window" in `energy_budget` instead.
+      the scene at the end of the record is "after the window" in `energy_budget` instead, and what returns
+      of it in `neglected`.
     - `recorded`: (wavelengths, samples) J that the receiver records of `energy`, without noise: background
       added, saturated, cut at the detection threshold, quantised. `jaxlidar.record` draws noise as well.
     - `wavelength`: (wavelengths,) nm, the lidar's.
@@ -292,7 +294,7 @@ def waveform_of_model(response: Response, model: WaveformModel) -> Waveform:
     lidar, time = model.lidar, model.time
     components = component_samples(response, model)
     reflectance = components["first"] + components["higher"]
-    energy_budget, neglected, lost = budget_terms(response, model)
+    terms = budget_terms(response, model)
     energy = energy_at_reference(lidar)[:, None] * relative_energy_samples(response, model)
     return Waveform(
         time=time,
@@ -301,10 +303,10 @@ def waveform_of_model(response: Response, model: WaveformModel) -> Waveform:
         energy=energy,
         stderr=jnp.zeros_like(reflectance),
         components=components,
-        neglected=neglected,
-        energy_budget=energy_budget,
-        energy_budget_stderr=jax.tree.map(jnp.zeros_like, energy_budget),
-        lost=lost,
+        neglected=terms.neglected,
+        energy_budget=terms.energy_budget,
+        energy_budget_stderr=jax.tree.map(jnp.zeros_like, terms.energy_budget),
+        lost=terms.lost,
         recorded=digitise(energy, lidar.wavelength, lidar.receiver),
         wavelength=lidar.wavelength,
         info={},

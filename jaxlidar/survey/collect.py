@@ -15,7 +15,7 @@ import numpy as np
 
 from jaxlidar._fields.checks import warn_user
 from jaxlidar._not_kept import NotKept
-from jaxlidar._summary import NOTABLE_FRACTION, percent, unfollowed_message
+from jaxlidar._summary import outside_message, unfollowed_message
 from jaxlidar.io.case import Case
 from jaxlidar.io.datasets import datasets_of
 from jaxlidar.io.groups import write_zarr_group
@@ -259,7 +259,7 @@ def _waveforms(strategy: AbstractStrategy, fields: dict[str, Any], info: dict[st
 
 
 def _warn_of_missing_light(strategy: AbstractStrategy, outside: np.ndarray, unfollowed: np.ndarray) -> None:
-    """Warn if much light of a shot is after the record, or may be in orders that were not followed.
+    """Warn if more light than the tolerance is after the record, or may be in orders that were not followed.
 
     `outside`, `unfollowed`: (shots,), `late` and `unfollowed` of `MISSING_LIGHT`.
     """
@@ -267,10 +267,5 @@ def _warn_of_missing_light(strategy: AbstractStrategy, outside: np.ndarray, unfo
     most_outside, most_unfollowed = (float(np.max(a, initial=0.0)) for a in (outside, unfollowed))
     if plan.scope.automatic_orders and most_unfollowed > strategy.rtol:
         warn_user(unfollowed_message(plan.orders, most_unfollowed), UnfollowedLightWarning)
-    if most_outside >= NOTABLE_FRACTION:
-        end = plan.sample_start + plan.sample_interval * plan.n_samples
-        warn_user(
-            f"{percent(most_outside)} of the light of a shot is still on its way when the record ends at "
-            f"{end:.4g} ns: see Waveforms.energy_budget",
-            LateLightWarning,
-        )
+    if most_outside > strategy.rtol:
+        warn_user(outside_message(most_outside, plan.record_end, "see Waveforms.neglected"), LateLightWarning)

@@ -123,8 +123,8 @@ def simulate_many(
     **Returns:** a `Waveforms`.
 
     **Warns:** `OffMapWarning` where footprints lie partly outside the voxel map of a stand,
-    `LateLightWarning` where much light arrives after the end of the record, `UnfollowedLightWarning` where
-    orders that are not followed may add more than `rtol`.
+    `LateLightWarning` where more of the light than `rtol` returns after the end of the record,
+    `UnfollowedLightWarning` where orders that are not followed may add more than `rtol`.
 
     **Raises:** TypeError for arguments of another class, and inside a JAX transformation. ValueError, before
     any work, for inadmissible arguments, a scene that reaches up to the sensor, shots that do not meet the

@@ -1,5 +1,6 @@
 """The waveforms of all shots of a survey."""
 
+import dataclasses
 import os
 from typing import Any, final
 
@@ -12,7 +13,7 @@ from jaxlidar._constants import SPEED_OF_LIGHT
 from jaxlidar._fields.checks import check_index, check_numbers
 from jaxlidar._not_kept import NotKept
 from jaxlidar._registry import detect_returns, true_returns
-from jaxlidar._summary import NOTABLE_FRACTION, percent
+from jaxlidar._summary import NOTABLE_FRACTION, neglected_fractions, percent
 from jaxlidar.io import netcdf
 from jaxlidar.io.case import Case
 from jaxlidar.io.datasets import datasets_of, keep_as_netcdf
@@ -178,33 +179,33 @@ class Waveforms(eqx.Module):
                 return {item: jnp.asarray(a[i]) for item, a in rows.items()}
             return jnp.asarray(rows[i])
 
-        return Waveform(
+        wave = Waveform(
             time=jnp.asarray(self.time),
             height=jnp.asarray(self.height_of_shot(i), self.time.dtype),
             wavelength=jnp.asarray(self.wavelength),
             **{name: row(name) for name in (*OPTIONAL_ARRAYS, "neglected", "lost")},
-            info=self._info(i),
+            info={"photons": int(self.photons[i]), "error": float(self.error[i])},
             truth=None if self.truth is None else self.truth[i],
         )
-
-    def _info(self, i: int) -> dict[str, Any]:
-        shot = {"photons": int(self.photons[i]), "error": float(self.error[i]), "stopped": self._stopped(i)}
         # Files of earlier versions do not have the altitude.
-        return shot | {name: self.info[name] for name in ("altitude",) if name in self.info}
+        altitude = {name: self.info[name] for name in ("altitude",) if name in self.info}
+        info = {**wave.info, "stopped": self._stopped(i, neglected_fractions(wave)[0]), **altitude}
+        return dataclasses.replace(wave, info=info)
 
-    def _stopped(self, i: int) -> str:
-        """Return the reason why tracing of shot i ended, as `Waveform.info` has it."""
+    def _stopped(self, i: int, unfollowed: float) -> str:
+        """Return the reason why tracing of shot i ended, as `Waveform.info` has it.
+
+        `unfollowed`: fraction of its light that orders beyond the last may add.
+        """
         # Standard errors are zero where nothing is random, and no photons are traced.
         if self.photons[i] == 0 and not np.any(self.stderr[i]):
             return StopReason.NOTHING_RANDOM.value
-        total = np.maximum(self.reflectance[i].sum(axis=-1), 1e-30)
-        neglected = float(np.max(self.neglected[i] / total))
         if self.error[i] > self.info["rtol"]:
             return StopReason.BATCHES_SPENT.value
         # Orders that the user chose are what was asked for. Files of earlier versions do not say who chose.
         automatic = self.info.get("automatic orders", True)
-        if automatic and self.info["orders"] > 1 and neglected > self.info["rtol"]:
-            return f"orders beyond {self.info['orders']} may add {percent(neglected)}"
+        if automatic and self.info["orders"] > 1 and unfollowed > self.info["rtol"]:
+            return f"orders beyond {self.info['orders']} may add {percent(unfollowed)}"
         return StopReason.TOLERANCE_MET.value
 
     @shows_progress

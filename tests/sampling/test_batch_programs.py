@@ -59,7 +59,7 @@ def test_a_batch_is_the_trace_of_its_key(orders, transmission, change):
     assert set(estimate.budget_names) == set(terms.energy_budget)
     for name, row in zip(estimate.budget_names, estimate.budget):
         np.testing.assert_allclose(row, terms.energy_budget[name], atol=2e-3)
-    np.testing.assert_allclose(estimate.neglected, terms.neglected, atol=2e-3)
+    np.testing.assert_allclose(estimate.unfollowed, terms.unfollowed, atol=2e-3)
 
 
 @pytest.mark.slow

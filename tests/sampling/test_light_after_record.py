@@ -1,5 +1,6 @@
 """Warnings of truncated light: light that arrives after the record, and orders beyond the last."""
 
+import functools
 import importlib
 import time
 import warnings
@@ -16,8 +17,9 @@ from tests.helpers import slab
 # The package's name `simulate` is the function.
 simulation = importlib.import_module("jaxlidar.simulation.one_scene")
 KEY = jax.random.key(5)
-BRIGHT = jl.Scene(plates=(jl.Plate(80.0, 0.4, 0.5),), ground=jl.Ground(reflectance=0.9))
-LIDAR = jl.Lidar()
+# Planes so far apart that the longest record of the plan ends early.
+BRIGHT = jl.Scene(plates=(jl.Plate(300.0, 0.4, 0.5),), ground=jl.Ground(reflectance=0.9))
+LIDAR, PALE = jl.Lidar(), jl.Ground(reflectance=0.3)
 
 
 def dense(albedo, depth=10.0, reflectance=None):
@@ -32,16 +34,99 @@ def late(wave):
 
 
 def test_a_window_of_the_plan_warns_and_one_of_the_user_does_not():
-    with pytest.warns(LateLightWarning, match=r"% of the light is still on its way .* give window="):
+    with pytest.warns(LateLightWarning, match=r"% of the returned light is still on its way .* give window="):
         wave = jl.simulate(LIDAR, BRIGHT, key=KEY, n_photons=2_000, max_orders=4)
     assert late(wave) > 0.01
-    assert "of the light is still on its way when the record ends" in str(wave)
+    assert "of the returned light is still on its way when the record ends" in str(wave)
     end = float(wave.time[-1])
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        user_window = jl.simulate(LIDAR, BRIGHT, key=KEY, n_photons=2_000, max_orders=4, window=(-600.0, end))
+        user_window = jl.simulate(
+            LIDAR, BRIGHT, key=KEY, n_photons=2_000, max_orders=4, window=(-2100.0, end)
+        )
     assert late(user_window) > 0.01
-    assert "of the light is still on its way when the record ends" in str(user_window)
+    assert "of the returned light is still on its way when the record ends" in str(user_window)
+
+
+def test_the_warning_follows_the_tolerance():
+    """Of the light that returns, some 16 % are on their way; a tolerance of 0.3 admits them."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        wave = jl.simulate(LIDAR, BRIGHT, key=KEY, n_photons=2_000, max_orders=4, rtol=0.3)
+    assert float(wave.neglected[0] / wave.reflectance.sum()) > 0.01
+
+
+@functools.cache
+def shrub(end):
+    """Simulate a small canopy with open sides on a slope, from which light grazes the ground.
+
+    It is recorded until `end`, ns. Dark and bright leaves return less and more than the ground does.
+    """
+    density = np.random.default_rng(0).uniform(0.0, 1.0, (8, 8, 20))
+    canopy = jl.Canopy(
+        jl.VoxelMap.from_lad(density, voxel_size=0.5), leaf=jl.LeafOptics([0.06, 0.46], [0.06, 0.46])
+    )
+    scene = jl.Scene(canopy=canopy, ground=jl.Ground(reflectance=0.3, slope=5.0))
+    lidar = jl.Lidar(wavelength=[532.0, 1064.0], position=(2.0, 2.0))
+    plan = jl.plan(lidar, scene, window=(-90.0, end), describe=False)
+    automatic_plan = jl.plan(lidar, scene, describe=False)
+    return jl.simulate(lidar, scene, key=KEY, plan=plan, n_photons=40_000), automatic_plan
+
+
+def returned_after(wave, time):
+    """Return the apparent reflectance, by wavelength, of samples after a time, ns."""
+    return np.asarray(wave.reflectance)[:, np.asarray(wave.time) > time].sum(axis=1)
+
+
+@pytest.mark.slow
+def test_neglected_is_what_returns_after_the_record():
+    """A record of 200 ns neglects what one of 4000 ns finds after 200 ns, within a factor of two.
+
+    Errors of the tail, which photons of weights of some 0.3 make, are 5 %.
+    """
+    short, long = shrub(200.0)[0], shrub(4000.0)[0]
+    missing = returned_after(long, 200.0)
+    assert np.all(missing > 0.01 * np.asarray(long.reflectance).sum(axis=1))
+
+    def is_right(neglected):
+        ratio = np.asarray(neglected) / missing
+        return np.all((ratio > 0.5) & (ratio < 2.0))
+
+    assert is_right(short.neglected)
+    in_flight = np.asarray(short.energy_budget["after the window"])
+    # Light that returns as much per energy as all light does, from dark leaves; all of it; and none of it.
+    total = np.asarray(short.reflectance).sum(axis=1)
+    for wrong in (in_flight * total, in_flight, np.zeros(2)):
+        assert not is_right(wrong)
+
+
+@pytest.mark.slow
+def test_the_record_is_as_long_as_the_tolerance_asks():
+    wave, plan = shrub(4000.0)
+    total = np.asarray(wave.reflectance).sum(axis=1)
+    assert plan.record_end < 2000.0
+    assert np.all(returned_after(wave, plan.record_end) < plan.rtol * total)
+    # A record of 300 ns does not do for bright leaves.
+    assert (returned_after(wave, 300.0) > plan.rtol * total)[1]
+
+
+def test_records_are_longer_where_light_grazes_the_ground():
+    """The time falls with the inverse of the tolerance; without open sides, or ground, it is shorter."""
+    leaf, voxels = jl.LeafOptics(0.4, 0.4), jl.VoxelMap.from_lad(np.full((4, 4, 10), 0.5), voxel_size=1.0)
+
+    def end(rtol, ground=PALE, **changes):
+        scene = jl.Scene(canopy=jl.Canopy(voxels, leaf=leaf, **changes), ground=ground)
+        return jl.plan(LIDAR, scene, rtol=rtol, describe=False).record_end
+
+    assert end(0.01) > 1.5 * end(0.02) > 2.0 * end(0.04)
+    assert end(0.01) > 2.0 * end(0.01, sides="periodic")
+    assert end(0.01) > 2.0 * end(0.01, ground=jl.Ground(reflectance=0.01))
+    assert end(0.01) > 2.0 * end(0.01, ground=None)
+    # There is no ground beyond a terrain of 40 m.
+    terrain = jl.Terrain(
+        np.random.default_rng(0).uniform(0.0, 0.1, (21, 21)), 2.0, (-20.0, -20.0), reflectance=0.3
+    )
+    assert end(0.01) > 2.0 * end(0.01, ground=terrain)
 
 
 @pytest.mark.slow
