@@ -154,7 +154,7 @@ class Plan(eqx.Module):
     >>> import jaxlidar as jl
     >>> plan = jl.plan(jl.Lidar(), jl.Scene(ground=jl.Ground()))
     >>> print(str(plan).splitlines()[-2])
-    31 samples of 1 ns from -15 ns, 7 fine bins of 0.5 ns
+    31 samples of 1 ns from -15 ns, 10 fine bins of 0.5 ns
     """
 
     config: TraceConfig = eqx.field(static=True)

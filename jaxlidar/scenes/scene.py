@@ -119,7 +119,9 @@ class Scene(eqx.Module):
         for i, plate in enumerate(self.plates):
             if not isinstance(plate.shape, Plane):
                 continue
-            plane = concrete_array(plate.shape.upward), concrete_array(plate.shape.foot)
+            # Within a program even what is computed of known values is traced, unless at compile time.
+            with jax.ensure_compile_time_eval():
+                plane = concrete_array(plate.shape.upward), concrete_array(plate.shape.foot)
             gaps = {f"meshes[{n}]": mesh.gap_to_plane(*plane) for n, mesh in enumerate(self.meshes)}
             if isinstance(self.ground, Terrain) and self.ground.relief:
                 distance = (_corners_of_cells(self.ground) - plane[1]) @ plane[0]
