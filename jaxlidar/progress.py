@@ -122,7 +122,7 @@ def shows_progress(function: Callable[_P, _R]) -> Callable[_P, _R]:
         progress: Any = kwargs.get("progress")
         if not isinstance(progress, bool):
             if not (progress is None or callable(progress)):
-                raise TypeError(f"progress = {progress!r} is neither True, a function nor None")
+                raise TypeError(f"progress = {progress!r} is no function")
             return function(*args, **kwargs)
         bar = _Bar() if progress else None
         kwargs["progress"] = bar

@@ -64,12 +64,7 @@ from jaxlidar.planning.path_lengths import (
     longest_segment,
     meshes_are_in_reach,
 )
-from jaxlidar.planning.record_times import (
-    bins_and_samples,
-    extend_to_air_return,
-    pulse_band,
-    target_bin_width,
-)
+from jaxlidar.planning.record_times import bins_and_samples, extend_to_air_return, target_bin_width
 from jaxlidar.planning.size_buckets import size_bucket
 from jaxlidar.scenes.scene import Scene, check_kinds
 from jaxlidar.scenes.surfaces import AbstractSheet
@@ -137,11 +132,10 @@ class Plan(eqx.Module):
     - `n_samples`: number of samples.
     - `bins_per_sample`: number of fine bins per sample.
     - `first_sample`: centre of the first sample, in fine bins from that of the first bin.
+    - `orders`: number of scatterings that are followed.
     - `n_traces`: number of traces in a response: one for each wavelength, where the trace depends on it.
     - `degree`: longest history of the orders that are followed; `config.degree` has room for longer ones.
     - `pulse_support`: times (ns) between which the pulse's energy lies.
-    - `pulse_band`: offsets of a sample's centre from a fine bin's, in fine bins, between which the sample
-      takes from the bin: a size bucket that holds the pulse.
     - `off`: names of the effects that are switched off.
     - `rtol`: relative accuracy aimed at.
     - `likely_beyond`: estimated fraction of the light in orders beyond the last.
@@ -165,10 +159,10 @@ class Plan(eqx.Module):
     first_sample: float = eqx.field(converter=as_argument)
     n_samples: int = eqx.field(static=True)
     bins_per_sample: int = eqx.field(static=True)
+    orders: int = eqx.field(static=True)
     n_traces: int = eqx.field(static=True)
     degree: int = eqx.field(static=True)
     pulse_support: tuple[float, float] = eqx.field(converter=as_argument)
-    pulse_band: tuple[int, int] = eqx.field(static=True)
     off: tuple[str, ...] = eqx.field(static=True)
     # Within a JAX transformation these decide what the plan covers.
     rtol: float = eqx.field(converter=as_argument)
@@ -178,7 +172,7 @@ class Plan(eqx.Module):
     table: _EffectTable = eqx.field(static=True)
 
     def __check_init__(self):
-        static_part = (dataclasses.astuple(self.config), self.pulse_band, self.off)
+        static_part = (dataclasses.astuple(self.config), self.off)
         if any(isinstance(x, float) for x in jax.tree.leaves(static_part)):
             raise TypeError("the static part of a plan has a float: each of its values would be a program")
 
@@ -186,11 +180,6 @@ class Plan(eqx.Module):
     def effects(self) -> tuple[Effect, ...]:
         """The table, an `Effect` for every row; empty where it was not asked for."""
         return self.table.rows
-
-    @property
-    def orders(self) -> int:
-        """Number of scatterings that are followed."""
-        return int(self.limits.orders)
 
     @property
     def n_rays(self) -> int:
@@ -522,10 +511,10 @@ def plan(
         n_samples=samples.count,
         bins_per_sample=samples.bins_per_sample,
         first_sample=(samples.start - bins.start) / bins.width,
+        orders=orders,
         n_traces=n_traces(keeps),
         degree=max_degree(orders, n_plates) if keeps else 0,
         pulse_support=pulse_support,
-        pulse_band=pulse_band(pulse_support, samples.interval, samples.start, bins),
         off=off,
         rtol=rtol,
         likely_beyond=order_choice.beyond,

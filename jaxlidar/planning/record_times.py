@@ -88,28 +88,24 @@ def bins_and_samples(
         # far from the first sample, so that programs are the same.
         first = min(first, begin - pulse_start)
     lead = math.ceil((edge - first) / width) + 3
-    after = math.ceil((last - edge) / width) + 3
-    if window is not None:
-        # An eighth more at most, so that a shift of the window by a little keeps the programs.
-        step = max((1 << max(lead + after, 1).bit_length()) // 16, 1)
-        lead = -(-lead // step) * step
-    count = lead + after
+    count = lead + math.ceil((last - edge) / width) + 3
     start = edge + width * (0.5 - lead)
     bins = TimeBins(start, width, max(count, 1), max_span=KERNEL_BINS)
     return bins, SampleTimes(begin, interval, samples, bins_per_sample)
 
 
 def pulse_band(
-    pulse_support: tuple[float, float], interval: float, sample_start: float, bins: TimeBins
+    pulse_support: tuple[float, float], interval: float, first_sample: float, bin_width: float
 ) -> tuple[int, int]:
     """Return the offsets of samples from fine bins, in fine bins, between which a sample takes from a bin.
 
-    `interval`, `sample_start`: of the samples, ns. Both offsets are rounded outwards to an eighth of
-    the width's octave, so that programs are not compiled for every pulse and window.
+    `interval`: of the samples, ns. `first_sample`: the first of them, in fine bins from the first bin. Both
+    offsets are rounded outwards to an eighth of the width's octave, so that programs are not compiled for
+    every pulse and window.
     """
-    first_sample, half = (sample_start - bins.start) / bins.width, 0.5 * interval
-    low = math.floor((pulse_support[0] - half) / bins.width - first_sample) - 2
-    high = math.ceil((pulse_support[1] + half) / bins.width - first_sample) + 2
+    half = 0.5 * interval
+    low = math.floor((pulse_support[0] - half) / bin_width - first_sample) - 2
+    high = math.ceil((pulse_support[1] + half) / bin_width - first_sample) + 2
     step = max((1 << (high - low).bit_length()) // 8, 1)
     return low // step * step, -(-high // step) * step
 

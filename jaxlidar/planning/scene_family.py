@@ -19,7 +19,6 @@ from jaxlidar.planning.effects import effects_of_family
 from jaxlidar.planning.memory import MAX_APPLIED_WAVELENGTHS, transformed_bytes
 from jaxlidar.planning.path_lengths import PathLengths
 from jaxlidar.planning.plan import Plan, plan
-from jaxlidar.planning.record_times import pulse_band
 from jaxlidar.planning.size_buckets import size_bucket
 from jaxlidar.scenes.scene import Scene, check_kinds
 from jaxlidar.sensors.lidar import Lidar
@@ -73,7 +72,6 @@ def union_plan(
         bins=bins,
         first_sample=(first.sample_start - start) / first.bins.width,
         pulse_support=pulse_support,
-        pulse_band=pulse_band(pulse_support, first.sample_interval, first.sample_start, bins),
         scope=scope,
     )
 

@@ -16,17 +16,19 @@ smooth on the scale of a fine bin, the error left is of fourth order in the bin'
 from typing import final
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxlidar._fields.checks import as_array
+from jaxlidar._fields.checks import as_array, is_traced
 from jaxlidar._jax.one_function import barrier
 from jaxlidar._jax.products import einsum
 from jaxlidar._jax.programs import Program
 from jaxlidar.planning.config import KERNEL_VARIANCE
 from jaxlidar.planning.memory import MAX_DENSE_PULSE, band_size
 from jaxlidar.planning.plan import Plan
+from jaxlidar.planning.record_times import pulse_band
 from jaxlidar.sensors.lidar import Lidar
 from jaxlidar.sensors.pulse import AbstractPulse
 
@@ -106,15 +108,21 @@ def pulse_convolution(
     # Offsets between a sample's centre and a fine bin's, in fine bins, from the last bin to the first.
     bins, bins_per_sample, n_samples = plan.bins, plan.bins_per_sample, n_samples or plan.n_samples
     low, high = -(bins.count - 1), (n_samples - 1) * bins_per_sample
-    # A band as wide as the pulse; of one offset at least, where the record lies beside all returns.
-    band_low, band_high = max(low, plan.pulse_band[0]), min(high, plan.pulse_band[1])
-    band_low = min(band_low, high)
-    band_high = max(band_high, band_low)
     dense_size = bins.count * n_samples
-    is_smaller = band_size(band_high - band_low + 1, bins_per_sample) < dense_size
-    is_dense = not is_smaller or (dense_size <= MAX_DENSE_PULSE and not as_band)
-    if not is_dense:
-        low, high = band_low, band_high
+    is_dense = dense_size <= MAX_DENSE_PULSE and not as_band
+    # The width of a band is a size: it is known where the plan is no argument of the program.
+    if not is_dense and not any(is_traced(x) for x in jax.tree.leaves(plan)):
+        band_low, band_high = pulse_band(
+            plan.pulse_support, plan.sample_interval, plan.first_sample, bins.width
+        )
+        # A band as wide as the pulse; of one offset at least, where the record lies beside all returns.
+        band_low = min(max(low, band_low), high)
+        band_high = max(min(high, band_high), band_low)
+        is_dense = band_size(band_high - band_low + 1, bins_per_sample) >= dense_size
+        if not is_dense:
+            low, high = band_low, band_high
+    else:
+        is_dense = True
     # The edges of samples lie a whole number of fine bins apart; one more at each end serves the fluxes.
     edge_offset = np.arange(low - 1, high + bins_per_sample + 2) - 0.5 * bins_per_sample
     edges = as_array((edge_offset + plan.first_sample) * bins.width)

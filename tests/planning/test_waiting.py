@@ -35,9 +35,9 @@ class Case:
     base: float = 2.0
     leaf_area_density: float = 0.5
     Cab: float = 40.0
-    window: tuple[float, float] = (-70.0, 40.0)
+    window: tuple[float, float] = (-70.0, 30.0)
     rtol: float = 0.3
-    n_layers: int = 10
+    n_layers: int = 12
     n_shots: int = 5
     n_columns: int = 6
 
@@ -89,10 +89,10 @@ CHANGES = {
     "base": 2.1,
     "leaf_area_density": 0.55,
     "Cab": 50.0,
-    "window": (-71.0, 39.0),
+    "window": (-71.0, 29.0),
     "rtol": 0.28,
 }
-SIZES = {"n_layers": 11, "n_shots": 6, "n_columns": 7}
+SIZES = {"n_layers": 13, "n_shots": 6, "n_columns": 7}
 
 
 def simulate(case):
@@ -131,7 +131,8 @@ def reflectance_factor(case):
 
 
 def truth_of(case):
-    return jl.truth_of(case.lidar, case.scene)
+    plan = jl.plan(case.lidar, case.scene, window=case.window, max_orders=1, describe=False)
+    return jl.truth_of(case.lidar, case.scene, plan=plan)
 
 
 def simulate_scenes(case):
@@ -188,7 +189,7 @@ def test_a_change_of_a_number_compiles_nothing(entry_point, compiled_names):
     compiled_names.clear()
     for _ in range(2):
         entry_point(Case())
-    assert len(compiled_names) > 3
+    assert len(compiled_names) > 1
     compiled = {}
     for name, value in CHANGES.items():
         compiled_names.clear()
@@ -198,6 +199,9 @@ def test_a_change_of_a_number_compiles_nothing(entry_point, compiled_names):
         name: set() for name in CHANGES
     }
     for name, value in SIZES.items():
+        if entry_point is retrieve and name != "n_shots":
+            # Fits are compiled for the voxels of their scene, which unknowns may stand for.
+            continue
         compiled_names.clear()
         entry_point(dataclasses.replace(Case(), **{name: value}))
         assert {*compiled_names} <= SHORT_PROGRAMS, name

@@ -309,7 +309,6 @@ def test_a_noise_model_is_differentiable_and_compiled():
     [
         ({"noise_model": "normal"}, TypeError, "noise_model"),
         ({"noise_model": excess_noise, "key": None}, ValueError, "admissible is one with a key"),
-        ({"noise_model": excess_noise, "mode": "photons"}, ValueError, "where mode = 'waveform'"),
         ({"noise_model": lambda key, e, w: e[0]}, ValueError, r"shape \(3,\); admissible is \(1, 3\)"),
         ({"noise_model": lambda key, e, w: None}, TypeError, "what noise_model returns is None"),
         ({"noise_model": excess_noise, "key": 3}, TypeError, "key"),

@@ -92,7 +92,7 @@ SOURCES = [
     path
     for package in ("jaxlidar", "inversion")
     for path in (Path(__file__).resolve().parents[2] / package).rglob("*.py")
-    if path.name != "_products.py"
+    if path.name != "products.py"
 ]
 
 
