@@ -134,7 +134,6 @@ class Plan(eqx.Module):
     - `first_sample`: centre of the first sample, in fine bins from that of the first bin.
     - `orders`: number of scatterings that are followed.
     - `n_traces`: number of traces in a response: one for each wavelength, where the trace depends on it.
-    - `degree`: longest history of the orders that are followed; `config.degree` has room for longer ones.
     - `pulse_support`: times (ns) between which the pulse's energy lies.
     - `off`: names of the effects that are switched off.
     - `rtol`: relative accuracy aimed at.
@@ -161,7 +160,6 @@ class Plan(eqx.Module):
     bins_per_sample: int = eqx.field(static=True)
     orders: int = eqx.field(static=True)
     n_traces: int = eqx.field(static=True)
-    degree: int = eqx.field(static=True)
     pulse_support: tuple[float, float] = eqx.field(converter=as_argument)
     off: tuple[str, ...] = eqx.field(static=True)
     # Within a JAX transformation these decide what the plan covers.
@@ -200,6 +198,13 @@ class Plan(eqx.Module):
     def record_end(self) -> float:
         """Time of the end of the last sample, ns."""
         return self.sample_start + self.sample_interval * self.n_samples
+
+    @property
+    def degree(self) -> int:
+        """Longest history of the orders that are followed; `config.degree` has room for longer ones."""
+        # Surfaces are the ground, if there is one, plates, and materials of meshes.
+        n_plates = len(self.config.surfaces) - self.config.has_ground - self.config.n_mesh_materials
+        return max_degree(self.orders, n_plates) if self.config.keeps_histories else 0
 
     @property
     def is_random(self) -> bool:
@@ -513,7 +518,6 @@ def plan(
         first_sample=(samples.start - bins.start) / bins.width,
         orders=orders,
         n_traces=n_traces(keeps),
-        degree=max_degree(orders, n_plates) if keeps else 0,
         pulse_support=pulse_support,
         off=off,
         rtol=rtol,

@@ -109,7 +109,7 @@ def test_optics_applied_while_light_is_traced_give_the_same(name):
     leaf = jl.Prospect(Cab=40.0) if "straight" not in name else LEAF
     canopy = jl.Canopy(slab(0.5, *bark), leaf=leaf, **{"hotspot": False, **scene_fields.pop("canopy")})
     scene = jl.Scene(canopy=canopy, **scene_fields)
-    plan = jl.plan(TWO_WAVELENGTHS, scene, max_orders=4, describe=False)
+    plan = jl.plan(TWO_WAVELENGTHS, scene, max_orders=4, histories=True, describe=False)
     assert plan.config.keeps_histories
     a, b = (
         jl.simulate(TWO_WAVELENGTHS, scene, key=KEY, plan=p, n_photons=2048)
