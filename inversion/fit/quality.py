@@ -177,31 +177,6 @@ def judge_fit(fit: JudgedFit, *, about: Sequence[str] | None = None) -> Verdict:
     return _worst_of(failures)
 
 
-def judge_fits(fits: Iterable[JudgedFit], *, about: Sequence[str] | None = None) -> tuple[Verdict, ...]:
-    """Judge whether each of many fits can be trusted: see `judge_fit`.
-
-    **Arguments:** `fits`: the `Retrieval` of `retrieve_many`. `about`: as for `judge_fit`.
-
-    **Returns:** a `Verdict` for each footprint.
-
-    **Raises:** ValueError for a name that the fits do not have.
-
-    **Example:**
-
-    >>> import jaxlidar as jl
-    >>> import inversion, jax
-    >>> scene = jl.Scene(ground=jl.Ground(height=0.5))
-    >>> wave = jl.simulate(jl.Lidar(), scene, key=jax.random.key(0))
-    >>> unknown = inversion.Unknown("ground.reflectance", bounds=(0.0, 1.0), name="brightness")
-    >>> records, time = wave.reflectance[None], wave.time
-    >>> problem = inversion.Problem(records, jl.Lidar(), scene, [unknown], noise=0.001, time=time)
-    >>> fits = inversion.retrieve_many(problem, key=jax.random.key(1))
-    >>> inversion.judge_fits(fits, about=["brightness"])
-    (Verdict(quality='good', reasons=()),)
-    """
-    return tuple(judge_fit(fit, about=about) for fit in fits)
-
-
 def judge_record(
     signal: Float[ArrayLike, " bins"],
     *,
