@@ -239,8 +239,8 @@ def multiple_scattering_tail(
 
     1. From one scattering to the next light takes the time of a mean free path in the canopy, or of the
        height between first and last return. The light that is still in the scene falls by the factor q each
-       time. In a canopy that is an upper bound, so that tails are made longer than 300 ns for what exceeds
-       the tolerance only.
+       time. In a canopy q is an upper bound: tails become longer than 300 ns for what exceeds the tolerance
+       only, by the ratio of the slowest mode (`slowest_decay`).
     2. Light that grazes the ground returns late, however fast the decay: see `grazing_tail`.
     3. The tail is at least three times as long as order one lasts, but no more than 60 ns of that, and 10 to
        3000 ns long in all. Memory is proportional to the length and to the number of histories
@@ -257,11 +257,14 @@ def multiple_scattering_tail(
     if fraction >= 1:
         return longest
 
-    def decay_time(remainder: float) -> float:
-        return math.log(remainder) / math.log(max(fraction, 1e-6)) * time_between
+    def decay_time(remainder: float, ratio: float) -> float:
+        return math.log(remainder) / math.log(max(ratio, 1e-6)) * time_between
 
-    tail = min(max(usual_tail, decay_time(min(LATE_FRACTION, LATE_SHARE * rtol))), longest)
-    required = max(decay_time(rtol), grazing_tail(scene, optics, last_return - first_return, rtol))
+    tail = min(max(usual_tail, decay_time(min(LATE_FRACTION, LATE_SHARE * rtol), fraction)), longest)
+    # Most of the light leaves a canopy faster than in the bound: what remains decays as in its slowest mode.
+    slowest = fraction if scene.canopy is None else float(slowest_decay(scene, optics))
+    grazing = grazing_tail(scene, optics, last_return - first_return, rtol)
+    required = max(decay_time(rtol, min(slowest, fraction)), grazing)
     return max(tail, min(required, max(TAIL[1] * MAX_HISTORIES / n_histories, TAIL[1]), LONG_TAIL))
 
 
