@@ -2,8 +2,8 @@
 
 Compiled programs depend on everything in a `TraceConfig`: names, switches, sizes of loops and arrays; and on
 the sizes of `TimeBins`. The numbers in `PathLimits`, and the start and the width of `TimeBins`, are arguments
-of these programs, so that another height or window compiles nothing. A `Plan` holds all three with Python
-numbers; a `trace.device_scene.DeviceScene` holds the latter two with JAX arrays.
+of these programs, so that another height or window compiles nothing. A `Plan` holds all three, with
+scalars of NumPy for numbers; a `trace.device_scene.DeviceScene` holds the latter two with JAX arrays.
 """
 
 import dataclasses
@@ -15,25 +15,18 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+# Fine bins over which a return at an instant is spread: the quadratic B-spline.
+KERNEL_BINS = 3
+# Second moment of that B-spline, in squared bins.
+KERNEL_VARIANCE = KERNEL_BINS / 12
+
 
 def as_argument(tree: Any) -> Any:
     """Return Python's numbers in a pytree as scalars of NumPy, which compiled programs take as arguments.
 
     Python's own numbers would be constants of these programs, and each value another program.
     """
-
-    def convert(number: Any) -> Any:
-        if isinstance(number, int) and not isinstance(number, bool):
-            return np.int32(number)
-        return np.float64(number) if isinstance(number, float) else number
-
-    return jax.tree.map(convert, tree)
-
-
-# Fine bins over which a return at an instant is spread: the quadratic B-spline.
-KERNEL_BINS = 3
-# Second moment of that B-spline, in squared bins.
-KERNEL_VARIANCE = KERNEL_BINS / 12
+    return jax.tree.map(lambda x: np.float64(x) if isinstance(x, int | float) else x, tree)
 
 
 @final
@@ -81,7 +74,7 @@ class Scatterer(NamedTuple):
 
 @final
 class PathLimits(eqx.Module):
-    """Bounds on the paths of rays and photons: floats in a plan, arrays in a device scene.
+    """Bounds on the paths of rays and photons: scalars of NumPy in a plan, arrays in a device scene.
 
     - `start_distance`: distance, m, before the reference plane at which all rays start, along the beam.
     - `max_segment`: longest segment, m, of a footprint ray that is deposited at once.
@@ -90,7 +83,6 @@ class PathLimits(eqx.Module):
       reference plane.
     - `reflection_probability`: probability of sampling reflection, rather than transmission, where a material
       does both. It does not depend on wavelength, so that histories stay monomials in the optics.
-    - `orders`: number of scatterings that are followed.
     """
 
     start_distance: float
@@ -98,7 +90,6 @@ class PathLimits(eqx.Module):
     max_flight: float
     max_path: float
     reflection_probability: float
-    orders: int | np.int32
 
 
 @dataclasses.dataclass(frozen=True)
@@ -121,7 +112,7 @@ class TraceConfig:
 
     - `max_ray_segments`: bound on the segments of a footprint ray (first order).
     - `max_faces`: bound on the voxel faces that a flight crosses.
-    - `order_steps`: length of the loop over orders of scattering; at least `PathLimits.orders`.
+    - `order_steps`: length of the loop over orders of scattering; at least `Plan.orders`.
     - `deposits_per_flight`: local estimates (next-event estimation) per free flight: points of each flight
       from which light returns to the sensor.
     - `degree`, `first_degree`: largest number of scatterings and passages through plates in a history, for

@@ -190,7 +190,7 @@ def calls_for_more_orders(
     optics: list[MaterialOptics],
     n_channels: int,
     rtol: Any,
-    orders: Any,
+    orders: int,
     histories: bool,
     xp: Any,
 ) -> Any:

@@ -64,7 +64,13 @@ from jaxlidar.planning.path_lengths import (
     longest_segment,
     meshes_are_in_reach,
 )
-from jaxlidar.planning.record_times import bins_and_samples, extend_to_air_return, target_bin_width
+from jaxlidar.planning.record_times import (
+    band_of_long_record,
+    bins_and_samples,
+    extend_to_air_return,
+    first_sample_in_bins,
+    target_bin_width,
+)
 from jaxlidar.planning.size_buckets import size_bucket
 from jaxlidar.scenes.scene import Scene, check_kinds
 from jaxlidar.scenes.surfaces import AbstractSheet
@@ -126,7 +132,7 @@ class Plan(eqx.Module):
     transformations, and plans that differ in lengths and times alone share a program.
 
     - `config`: the static configuration of the tracer: scatterers, switches, sizes of loops and batches.
-    - `limits`: lengths that bound rays and photons, and the number of orders.
+    - `limits`: lengths that bound rays and photons.
     - `bins`: the fine time bins, into which returns are sorted.
     - `sample_start`, `sample_interval`: time of the first sample, and the interval between samples, ns.
     - `n_samples`: number of samples.
@@ -135,6 +141,8 @@ class Plan(eqx.Module):
     - `orders`: number of scatterings that are followed.
     - `n_traces`: number of traces in a response: one for each wavelength, where the trace depends on it.
     - `pulse_support`: times (ns) between which the pulse's energy lies.
+    - `pulse_band`: of a long record, offsets of a sample from a fine bin, in fine bins, between which the
+      sample takes from the bin; None where a matrix of all bins and samples is small.
     - `off`: names of the effects that are switched off.
     - `rtol`: relative accuracy aimed at.
     - `likely_beyond`: estimated fraction of the light in orders beyond the last.
@@ -161,6 +169,7 @@ class Plan(eqx.Module):
     orders: int = eqx.field(static=True)
     n_traces: int = eqx.field(static=True)
     pulse_support: tuple[float, float] = eqx.field(converter=as_argument)
+    pulse_band: tuple[int, int] | None = eqx.field(static=True)
     off: tuple[str, ...] = eqx.field(static=True)
     # Within a JAX transformation these decide what the plan covers.
     rtol: float = eqx.field(converter=as_argument)
@@ -452,7 +461,6 @@ def plan(
         max_flight=path_lengths.longest_flight(max_path + path_lengths.start_distance),
         max_path=max_path,
         reflection_probability=reflection_probability(optics),
-        orders=orders,
     )
     # 5. Memory decides between histories and applied optics, and how many orders there is room for.
     straight = scene.canopy is not None and scene.canopy.is_straight
@@ -515,10 +523,11 @@ def plan(
         sample_interval=samples.interval,
         n_samples=samples.count,
         bins_per_sample=samples.bins_per_sample,
-        first_sample=(samples.start - bins.start) / bins.width,
+        first_sample=first_sample_in_bins(samples.start, bins),
         orders=orders,
         n_traces=n_traces(keeps),
         pulse_support=pulse_support,
+        pulse_band=band_of_long_record(pulse_support, samples, bins),
         off=off,
         rtol=rtol,
         likely_beyond=order_choice.beyond,

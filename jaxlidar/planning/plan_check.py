@@ -189,7 +189,7 @@ def _misfit_materials(plan: Plan, lidar: Lidar, scene: Scene, xp: Any) -> Iterat
     if scope.automatic_orders:
         albedo, n_channels = largest_albedo(optics, xp), len(config.channels)
         needs_more = calls_for_more_orders(
-            scene, optics, n_channels, plan.rtol, plan.limits.orders, config.keeps_histories, xp
+            scene, optics, n_channels, plan.rtol, plan.orders, config.keeps_histories, xp
         )
 
         def few_orders() -> str:

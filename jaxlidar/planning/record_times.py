@@ -7,6 +7,7 @@ from typing import NamedTuple
 from jaxlidar._constants import SPEED_OF_LIGHT
 from jaxlidar._fields.checks import check_number, check_numbers, check_shape, concrete_number
 from jaxlidar.planning.config import KERNEL_BINS, TimeBins
+from jaxlidar.planning.memory import MAX_DENSE_PULSE
 from jaxlidar.planning.path_lengths import PathLengths
 from jaxlidar.scenes.scene import Scene
 from jaxlidar.sensors.lidar import Lidar
@@ -94,20 +95,36 @@ def bins_and_samples(
     return bins, SampleTimes(begin, interval, samples, bins_per_sample)
 
 
+def first_sample_in_bins(start: float, bins: TimeBins) -> float:
+    """Return the centre of the first sample, at `start` ns, in fine bins from that of the first bin.
+
+    Times from the emission may be so large that single precision does not resolve their difference.
+    """
+    return (start - bins.start) / bins.width
+
+
 def pulse_band(
     pulse_support: tuple[float, float], interval: float, first_sample: float, bin_width: float
 ) -> tuple[int, int]:
-    """Return the offsets of samples from fine bins, in fine bins, between which a sample takes from a bin.
+    """Return the offsets of a sample from a fine bin, in fine bins, between which it takes from the bin.
 
-    `interval`: of the samples, ns. `first_sample`: the first of them, in fine bins from the first bin. Both
-    offsets are rounded outwards to an eighth of the width's octave, so that programs are not compiled for
-    every pulse and window.
+    They are rounded outwards to an eighth of the width's octave, so that programs are not compiled for every
+    pulse and window. `interval`: of the samples, ns.
     """
     half = 0.5 * interval
     low = math.floor((pulse_support[0] - half) / bin_width - first_sample) - 2
     high = math.ceil((pulse_support[1] + half) / bin_width - first_sample) + 2
     step = max((1 << (high - low).bit_length()) // 8, 1)
     return low // step * step, -(-high // step) * step
+
+
+def band_of_long_record(
+    pulse_support: tuple[float, float], samples: SampleTimes, bins: TimeBins
+) -> tuple[int, int] | None:
+    """Return the `pulse_band` of a record; None where a matrix of all bins and samples is small."""
+    if bins.count * samples.count <= MAX_DENSE_PULSE:
+        return None
+    return pulse_band(pulse_support, samples.interval, first_sample_in_bins(samples.start, bins), bins.width)
 
 
 def extend_to_air_return(bins: TimeBins, lidar: Lidar, samples: SampleTimes) -> TimeBins:

@@ -19,6 +19,7 @@ from jaxlidar.planning.effects import effects_of_family
 from jaxlidar.planning.memory import MAX_APPLIED_WAVELENGTHS, transformed_bytes
 from jaxlidar.planning.path_lengths import PathLengths
 from jaxlidar.planning.plan import Plan, plan
+from jaxlidar.planning.record_times import SampleTimes, band_of_long_record, first_sample_in_bins
 from jaxlidar.planning.size_buckets import size_bucket
 from jaxlidar.scenes.scene import Scene, check_kinds
 from jaxlidar.sensors.lidar import Lidar
@@ -67,11 +68,13 @@ def union_plan(
     )
     pulse_support = (min(low for low, _ in supports), max(high for _, high in supports))
     scope = dataclasses.replace(united.scope, pulse_feature=min(p.scope.pulse_feature for p in plans))
+    samples = SampleTimes(first.sample_start, first.sample_interval, first.n_samples, first.bins_per_sample)
     return dataclasses.replace(
         united,
         bins=bins,
-        first_sample=(first.sample_start - start) / first.bins.width,
+        first_sample=first_sample_in_bins(samples.start, bins),
         pulse_support=pulse_support,
+        pulse_band=band_of_long_record(pulse_support, samples, bins),
         scope=scope,
     )
 

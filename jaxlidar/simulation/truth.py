@@ -114,7 +114,7 @@ def first_order_setup(setup: Setup) -> Setup:
     config = plan.config
     # Labels shall be no less accurate than waveforms of many batches.
     n_rays = config.n_rays if config.n_rays == 1 else max(config.n_rays, _RAYS_AT_ONCE)
-    plan = dataclasses.replace(plan.with_limits(orders=1), orders=1).with_config(
+    plan = dataclasses.replace(plan, orders=1).with_config(
         order_steps=1,
         keeps_histories=True,
         n_rays=n_rays,

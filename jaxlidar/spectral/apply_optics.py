@@ -30,6 +30,7 @@ from jaxlidar._summary import unfollowed_return
 from jaxlidar.planning.channels import channel_optics
 from jaxlidar.planning.config import KERNEL_VARIANCE
 from jaxlidar.planning.effects import allows_interreflection
+from jaxlidar.planning.record_times import pulse_band
 from jaxlidar.planning.setup import Setup
 from jaxlidar.planning.size_buckets import size_bucket
 from jaxlidar.scenes.atmosphere import Atmosphere
@@ -228,7 +229,8 @@ def make_survey_model(setup: Setup) -> WaveformModel:
     """
     plan = setup.plan
     n_samples = size_bucket(plan.n_samples, SAMPLE_BUCKETS)
-    convolution = pulse_convolution(setup.lidar, plan, n_samples, as_band=True)
+    band = pulse_band(plan.pulse_support, plan.sample_interval, plan.first_sample, plan.bins.width)
+    convolution = pulse_convolution(setup.lidar, plan, n_samples, band)
     return _make_model(setup, convolution, plan.sample_interval, plan.config.degree)
 
 

@@ -16,19 +16,17 @@ smooth on the scale of a fine bin, the error left is of fourth order in the bin'
 from typing import final
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxlidar._fields.checks import as_array, is_traced
+from jaxlidar._fields.checks import as_array
 from jaxlidar._jax.one_function import barrier
 from jaxlidar._jax.products import einsum
 from jaxlidar._jax.programs import Program
 from jaxlidar.planning.config import KERNEL_VARIANCE
-from jaxlidar.planning.memory import MAX_DENSE_PULSE, band_size
+from jaxlidar.planning.memory import band_size
 from jaxlidar.planning.plan import Plan
-from jaxlidar.planning.record_times import pulse_band
 from jaxlidar.sensors.lidar import Lidar
 from jaxlidar.sensors.pulse import AbstractPulse
 
@@ -98,31 +96,24 @@ class PulseConvolution(eqx.Module):
 
 
 def pulse_convolution(
-    lidar: Lidar, plan: Plan, n_samples: int | None = None, *, as_band: bool = False
+    lidar: Lidar, plan: Plan, n_samples: int | None = None, band: tuple[int, int] | None = None
 ) -> PulseConvolution:
     """Make the convolution of a lidar's pulse with its digitiser's first `n_samples` samples.
 
-    Default None: as many as the plan has. `as_band`: True for a band wherever its matrices are the smaller
-    ones, which takes less time; programs are then compiled for the width of the pulse.
+    Default None: as many as the plan has. `band`: offsets (see `pulse_band`) beyond which samples take from
+    no bin, for a band in place of the matrix wherever that takes less. Default None: that of the plan.
     """
     # Offsets between a sample's centre and a fine bin's, in fine bins, from the last bin to the first.
     bins, bins_per_sample, n_samples = plan.bins, plan.bins_per_sample, n_samples or plan.n_samples
     low, high = -(bins.count - 1), (n_samples - 1) * bins_per_sample
-    dense_size = bins.count * n_samples
-    is_dense = dense_size <= MAX_DENSE_PULSE and not as_band
-    # The width of a band is a size: it is known where the plan is no argument of the program.
-    if not is_dense and not any(is_traced(x) for x in jax.tree.leaves(plan)):
-        band_low, band_high = pulse_band(
-            plan.pulse_support, plan.sample_interval, plan.first_sample, bins.width
-        )
-        # A band as wide as the pulse; of one offset at least, where the record lies beside all returns.
-        band_low = min(max(low, band_low), high)
-        band_high = max(min(high, band_high), band_low)
-        is_dense = band_size(band_high - band_low + 1, bins_per_sample) >= dense_size
+    band, is_dense = plan.pulse_band if band is None else band, True
+    if band is not None:
+        # A band of one offset at least, where the record lies beside all returns.
+        band_low = min(max(low, band[0]), high)
+        band_high = max(min(high, band[1]), band_low)
+        is_dense = band_size(band_high - band_low + 1, bins_per_sample) >= bins.count * n_samples
         if not is_dense:
             low, high = band_low, band_high
-    else:
-        is_dense = True
     # The edges of samples lie a whole number of fine bins apart; one more at each end serves the fluxes.
     edge_offset = np.arange(low - 1, high + bins_per_sample + 2) - 0.5 * bins_per_sample
     edges = as_array((edge_offset + plan.first_sample) * bins.width)

@@ -71,6 +71,7 @@ class DeviceScene(eqx.Module):
     The plan:
 
     - `config`: the static configuration. `limits`, `bins`: path limits and time bins, with arrays as numbers.
+    - `orders`: number of scatterings that are followed.
     - `derivatives`: the derivatives that may be taken: "all", "forward" alone, or "none". The fewer, the
       faster.
 
@@ -95,6 +96,7 @@ class DeviceScene(eqx.Module):
     next_history: Int[Array, "histories channels"]
     limits: PathLimits
     bins: TimeBins
+    orders: Int[Array, ""]
     config: TraceConfig = eqx.field(static=True)
     surface_laws: tuple[int, ...] = eqx.field(static=True)
     leaf_law: int = eqx.field(static=True)
@@ -183,15 +185,16 @@ def build_device_scene(setup: Setup, *, derivatives: Derivatives = "all") -> Dev
 
 def geometry_arguments(
     setup: Setup, derivatives: Derivatives
-) -> tuple[Lidar, Scene, PathLimits, TimeBins, TraceConfig]:
+) -> tuple[Lidar, Scene, PathLimits, TimeBins, Int[Array, ""], TraceConfig]:
     """Return the arguments of `compiled_geometry`."""
     limits, bins = jax.tree.map(jnp.asarray, (setup.plan.limits, setup.plan.bins))
+    orders = jnp.asarray(setup.plan.orders, jnp.int32)
     config = setup.plan.config
     # Orders are rounded up to sizes that programs share, which costs little time but memory for each tangent.
     if derivatives != "none":
         # Each tangent has its own tally of histories: no room for orders beyond the last.
         config = dataclasses.replace(config, degree=setup.plan.degree)
-    return _without_spectrum(setup.lidar), setup.scene, limits, bins, config
+    return _without_spectrum(setup.lidar), setup.scene, limits, bins, orders, config
 
 
 def complete_device_scene(geometry: DeviceScene, setup: Setup, derivatives: Derivatives) -> DeviceScene:
@@ -216,7 +219,12 @@ def _without_spectrum(lidar: Lidar) -> Lidar:
 
 
 def _build_geometry(
-    lidar: Lidar, scene: Scene, limits: PathLimits, bins: TimeBins, config: TraceConfig
+    lidar: Lidar,
+    scene: Scene,
+    limits: PathLimits,
+    bins: TimeBins,
+    orders: Int[Array, ""],
+    config: TraceConfig,
 ) -> DeviceScene:
     """Build the geometry of a device scene.
 
@@ -260,6 +268,7 @@ def _build_geometry(
         next_history=jnp.asarray(histories(len(config.channels), config.degree).next_history),
         limits=limits,
         bins=bins,
+        orders=orders,
         config=config,
         surface_laws=surface_laws,
         leaf_law=leaf_law,

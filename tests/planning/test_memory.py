@@ -20,6 +20,7 @@ from inversion.fit.planning import plan_for_bounds, trace_sizes
 from inversion.fit.unknowns import bind_unknowns
 from jaxlidar.planning import memory
 from jaxlidar.planning.memory import check_memory, format_bytes, memory_limit
+from jaxlidar.planning.record_times import pulse_band
 from jaxlidar.sampling.batch_programs import make_batch_tracer
 from jaxlidar.spectral.pulse_convolution import PulseConvolution, pulse_convolution
 from jaxlidar.spectral.waveform import waveform_of_model
@@ -200,6 +201,8 @@ def test_a_grazing_beam_over_a_slope_takes_no_matrix():
     scene = jl.Scene(ground=jl.Ground(reflectance=0.4), plates=(jl.Plate(20.0, 0.2, 0.1),))
     plan = jl.plan(lidar, scene, max_orders=1, describe=False)
     assert plan.bins.count * plan.n_samples > memory.MAX_DENSE_PULSE
+    # The record of a plan that is an argument of a program has a band, too.
+    assert not jax.eval_shape(lambda plan: pulse_convolution(lidar, plan), plan).is_dense
     assert plan.memory < 1e9
     wave = jl.simulate(lidar, scene, key=KEY, plan=plan)
     total = float(wave.reflectance.sum())
@@ -210,6 +213,12 @@ def test_a_grazing_beam_over_a_slope_takes_no_matrix():
     assert total == pytest.approx((0.2 + 0.4 * 0.1**2) * cosine, rel=2e-3)
 
 
+def band_of(plan):
+    """Return the band of the pulse of a plan whose record is too short to have one."""
+    assert plan.pulse_band is None
+    return pulse_band(plan.pulse_support, plan.sample_interval, plan.first_sample, plan.bins.width)
+
+
 @pytest.mark.parametrize(
     ("pulse", "window"),
     [
@@ -218,15 +227,14 @@ def test_a_grazing_beam_over_a_slope_takes_no_matrix():
         (jl.SampledPulse([-2.0, 0.0, 9.0], [0.0, 1.0, 0.0]), (7.0, 60.0)),
     ],
 )
-def test_the_band_is_the_matrix(pulse, window, monkeypatch):
+def test_the_band_is_the_matrix(pulse, window):
     lidar = jl.Lidar(pulse=pulse)
     plan = jl.plan(lidar, jl.Scene(plates=plates(1), ground=GROUND), window=window, describe=False)
     fine = jax.random.uniform(KEY, (2, plan.bins.count))
     dense = jax.jit(lambda: pulse_convolution(lidar, plan))()
     assert dense.is_dense
     expected = dense(fine)
-    monkeypatch.setattr("jaxlidar.spectral.pulse_convolution.MAX_DENSE_PULSE", 1)
-    band = jax.jit(lambda: pulse_convolution(lidar, plan))()
+    band = jax.jit(lambda: pulse_convolution(lidar, plan, band=band_of(plan)))()
     assert not band.is_dense
     assert band.fractions.size <= dense.fractions.size
     np.testing.assert_allclose(band(fine), expected, atol=1e-6 * float(np.max(expected)))
@@ -262,14 +270,12 @@ def test_the_smaller_of_matrix_and_band_is_applied():
     scene = jl.Scene(ground=GROUND)
     short, long = (jl.Lidar(pulse=jl.GaussianPulse(fwhm)) for fwhm in (4.0, 200.0))
     window = (-200.0, 200.0)
-    chosen = [
-        pulse_convolution(lidar, jl.plan(lidar, scene, window=window, describe=False), as_band=True)
-        for lidar in (short, long)
-    ]
+    plans = [jl.plan(lidar, scene, window=window, describe=False) for lidar in (short, long)]
+    chosen = [pulse_convolution(lidar, plan, band=band_of(plan)) for lidar, plan in zip((short, long), plans)]
     assert [convolution.is_dense for convolution in chosen] == [False, True]
     # A record beside all returns takes nothing.
     beside = jl.plan(short, scene, window=(-520.0, -500.0), describe=False)
-    convolution = pulse_convolution(short, beside, as_band=True)
+    convolution = pulse_convolution(short, beside, band=band_of(beside))
     assert float(jnp.abs(convolution(jnp.ones(beside.bins.count))).max()) < 1e-6
 
 

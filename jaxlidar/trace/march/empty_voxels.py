@@ -145,7 +145,7 @@ class EmptyVoxels(NamedTuple):
         medium = scene.medium
         assert medium is not None
         choice, position = draws
-        is_last = order + 1 == scene.limits.orders
+        is_last = order + 1 == scene.orders
         probability = jnp.where(is_last, 1.0, 1.0 / (order + 2).astype(choice.dtype))
         chosen = undecided & (choice < probability)
         # Not only the box of occupied voxels, at which marches end.

@@ -257,7 +257,7 @@ class PhotonBatch:
 
         def order_step(carry, order):
             # The loop is as long as its size bucket; orders beyond the plan's are passed over.
-            return lax.cond(order < scene.limits.orders, one_order, lambda c, _: c, carry, order), None
+            return lax.cond(order < scene.orders, one_order, lambda c, _: c, carry, order), None
 
         return lax.scan(order_step, (lanes, sums), jnp.arange(scene.config.order_steps))[0]
 
@@ -267,7 +267,7 @@ def trace_higher_orders(
     key: PRNGKeyArray,
     nodes: EntryNodes | None = None,
 ) -> HigherOrderTally:
-    """Trace a batch of photons through up to `limits.orders` scatterings; sums are means per photon.
+    """Trace a batch of photons through up to `orders` scatterings; sums are means per photon.
 
     With `nodes`, light enters about these and is tallied by node: sums are means per photon of a node.
     """
