@@ -1,4 +1,4 @@
-"""Texts of numbers and objects, for messages and for `print`."""
+"""Texts of numbers, objects and missing light, for messages and for `print`."""
 
 import dataclasses
 from collections.abc import Mapping
@@ -9,6 +9,8 @@ import jax
 import numpy as np
 from jax.core import Tracer
 
+# Light that a record misses is reported from this fraction of the returned light on.
+NOTABLE_FRACTION = 0.01
 # From here on, six digits do not resolve a metre of a map coordinate; beyond, digits say nothing.
 _COORDINATE, _HUGE = 1e5, 1e10
 # Longest line of an object's text, and the longest row of numbers that is written out.
@@ -69,3 +71,25 @@ def _array_text(array: np.ndarray) -> str:
     if values.size == 0:
         return f"{shape} values, none finite"
     return f"{shape} values from {number_text(values.min())} to {number_text(values.max())}"
+
+
+def percent(fraction: float) -> str:
+    """Format a fraction in percent with two significant digits."""
+    # Rounded as text first, as "g" alone writes 100 as 1e+02.
+    return f"{float(f'{100 * fraction:.2g}'):g} %"
+
+
+def outside_message(fraction: float, end: float, advice: str) -> str:
+    """Return the text of the warning that a fraction of the returned light comes after `end`, ns."""
+    return (
+        f"some {percent(fraction)} of the returned light is still on its way when the record ends at "
+        f"{end:.4g} ns: {advice}"
+    )
+
+
+def unfollowed_message(orders: int, fraction: float) -> str:
+    """Return the text of the warning that orders beyond the last may add a fraction of the light."""
+    return (
+        f"orders of scattering beyond {orders} may add {percent(fraction)} of the light: give "
+        "max_orders=, or fewer wavelengths at once, for which more orders are followed"
+    )

@@ -39,7 +39,7 @@ from inversion.fit.unknowns import BoundUnknown, Setter, set_values
 from jaxlidar import Lidar, Plan, Scene, Survey, make_setup
 from jaxlidar.extend import Program, side_by_side
 from jaxlidar.spectral.apply_optics import make_waveform_model, total_samples
-from jaxlidar.survey.per_shot import ShotGeometry, aim_shot, shot_geometry
+from jaxlidar.survey.per_shot import ShotGeometry, SurveyContext, shot_geometry
 from jaxlidar.trace.device_scene import build_device_scene
 from jaxlidar.trace.response import trace_device_scene
 
@@ -89,10 +89,11 @@ def _waveforms(
         scene = _windowed(scene, shots.window, inputs.window_shape)
     setup = make_setup(inputs.lidar, scene, inputs.plan)
     # What does not depend on the shot is computed once for the chunk, outside of the loop over its shots.
-    device_scene, model = build_device_scene(setup, derivatives="all"), make_waveform_model(setup)
+    device_scene = build_device_scene(setup, derivatives="all")
+    context = SurveyContext(device_scene, make_waveform_model(setup), scene.atmosphere)
 
     def waveform(shot: ShotGeometry) -> Float[Array, "wavelengths samples"]:
-        aimed = aim_shot(device_scene, model, scene.atmosphere, shot, inputs.key)
+        aimed = context.aim(shot, inputs.key)
         return total_samples(trace_device_scene(aimed.scene, aimed.key), aimed.model)
 
     # One after the other: a loop keeps the temporaries of one shot, where vmap would keep those of all.

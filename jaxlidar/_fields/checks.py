@@ -126,6 +126,11 @@ def is_traced(x: object) -> bool:
     return isinstance(x, Tracer)
 
 
+def has_tracers(tree: Any) -> bool:
+    """Return True if a JAX transformation is tracing any leaf of a pytree."""
+    return any(map(is_traced, jax.tree.leaves(tree)))
+
+
 def is_within_program() -> bool:
     """Return True while JAX traces a program (jit, scan, eval_shape): even constants are then traced."""
     return is_traced(jnp.zeros(()))

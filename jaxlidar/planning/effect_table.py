@@ -4,11 +4,9 @@ import functools
 import math
 from collections.abc import Callable, Sequence
 
-import jax
-
 from jaxlidar._constants import SPEED_OF_LIGHT
-from jaxlidar._fields.checks import concrete_number, is_traced
-from jaxlidar._summary import percent
+from jaxlidar._fields.checks import concrete_number, has_tracers, is_traced
+from jaxlidar._text import percent
 from jaxlidar.planning.bounds import Bounds
 from jaxlidar.planning.config import TimeBins
 from jaxlidar.planning.effects import (
@@ -59,7 +57,7 @@ def effect_table(
     reasons = dict.fromkeys(EFFECT_NAMES, "in the scene") | {"multiple scattering": order_choice.reason}
     reasons |= _sized_reasons(lidar, scene)
     # Bounds need values, which are unknown while they are being traced, and hold for planes below a sensor.
-    bounded = not any(is_traced(x) for x in jax.tree.leaves((lidar, scene))) and surfaces_are_planes(scene)
+    bounded = not has_tracers((lidar, scene)) and surfaces_are_planes(scene)
     bounded = bounded and not lidar.has_sensor_position
 
     # Most rows have the same effects switched off, and share one set of bounds.

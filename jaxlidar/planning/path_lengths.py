@@ -20,7 +20,7 @@ from jaxlidar._fields.checks import (
     concrete_array,
     concrete_number,
     fixed_array,
-    is_traced,
+    has_tracers,
 )
 from jaxlidar._vectors import FAR, vec
 from jaxlidar.planning.config import KERNEL_BINS
@@ -460,7 +460,7 @@ def _check_clear_of_triangles(shots: Survey, mesh: MeshSurface) -> None:
 
     **Raises:** ValueError with the shot.
     """
-    if any(is_traced(x) for x in jax.tree.leaves(mesh)):
+    if has_tracers(mesh):
         return
     sensor, shot = np.unique(shots.sensor, axis=0, return_index=True)
     boxes = mesh.bounds()
@@ -587,7 +587,7 @@ def meshes_are_in_reach(shots: Lidar | Survey, scene: Scene, xp: Any = np) -> An
 
     `xp`: jax.numpy for a lidar that a JAX transformation traces; default numpy.
     """
-    if any(is_traced(x) for mesh in scene.meshes for x in jax.tree.leaves(mesh)):
+    if has_tracers(scene.meshes):
         return True
     single = TracedBeam if xp is jnp else Survey
     survey = shots if isinstance(shots, Survey) else single.of(shots)
@@ -654,7 +654,7 @@ def check_scene_near_beams(shots: Lidar | Survey, scene: Scene) -> None:
         boxes["canopy"] = [concrete(a) for a in (voxels.origin, voxels.top)]
     if scene.period is None:
         for i, mesh in enumerate(scene.meshes):
-            if not any(is_traced(x) for x in jax.tree.leaves(mesh)):
+            if not has_tracers(mesh):
                 bounds = mesh.bounds()
                 boxes[f"meshes[{i}]"] = [bounds[:, 0].min(axis=0), bounds[:, 1].max(axis=0)]
     for name, (low, high) in boxes.items():

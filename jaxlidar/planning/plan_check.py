@@ -96,10 +96,12 @@ def _is_free_of(checks: Sequence[Callable], plan: Plan, lidar: Lidar, scene: Sce
 
 
 def _check(plan: Plan, lidar: Lidar, scene: Scene, checks: Sequence[Callable]) -> None:
-    check_footprints_on_terrain(lidar, scene)
-    for misfit in _misfits(plan, lidar, scene, checks, np):
-        if misfit.is_present:
-            raise ValueError(f"the plan does not fit: {misfit.message()}")
+    # While JAX traces a program, even what is computed of known values is traced, unless at compile time.
+    with jax.ensure_compile_time_eval():
+        check_footprints_on_terrain(lidar, scene)
+        for misfit in _misfits(plan, lidar, scene, checks, np):
+            if misfit.is_present:
+                raise ValueError(f"the plan does not fit: {misfit.message()}")
 
 
 def _misfits(plan: Plan, lidar: Lidar, scene: Scene, checks: Sequence[Callable], xp: Any) -> Iterator[Misfit]:

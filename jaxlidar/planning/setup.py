@@ -4,11 +4,10 @@ import dataclasses
 from typing import final
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from jaxlidar._fields.checks import check_kind, is_traced
+from jaxlidar._fields.checks import check_kind, has_tracers, is_traced
 from jaxlidar._fields.ranges import inadmissible
 from jaxlidar.planning.effects import without_effects
 from jaxlidar.planning.local_origin import move_aim_to_origin
@@ -99,14 +98,14 @@ def make_setup(lidar: Lidar, scene: Scene, plan: Plan) -> Setup:
                 f"the plan is for a map whose {name} is zero everywhere, but {name} is being traced by a JAX "
                 f'transformation; make the plan with effects={{"{name}": True}}'
             )
-    if plan.scope.unreached_meshes and any(is_traced(x) for x in jax.tree.leaves(scene.meshes)):
+    if plan.scope.unreached_meshes and has_tracers(scene.meshes):
         raise ValueError(
             "the plan leaves out meshes that no ray meets, but they are being traced by a JAX "
             'transformation; make the plan with effects={"meshes": True}'
         )
     # A traced value cannot raise an error. NaN in all waveforms cannot be overlooked, and costs one product.
     admissible, covered = jnp.ones(()), jnp.asarray(True)
-    if any(is_traced(x) for x in jax.tree.leaves((lidar, scene, plan))):
+    if has_tracers((lidar, scene, plan)):
         admissible = jnp.where(inadmissible((lidar, scene)), jnp.nan, admissible)
         covered = is_covered(plan, lidar, scene)
     return Setup(*without_effects(*move_aim_to_origin(lidar, scene), plan.off), plan, admissible, covered)

@@ -29,7 +29,7 @@ from jaxlidar._fields.checks import (
     check_shape,
     warn_user,
 )
-from jaxlidar._summary import percent
+from jaxlidar._text import percent
 from jaxlidar.optics.leaf_angles import ANGLE_CELLS, LeafAngles
 from jaxlidar.plants.grid import Grid, voxel_edges
 from jaxlidar.plants.tree import Tree

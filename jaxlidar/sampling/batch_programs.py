@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray, UInt32
 
-from jaxlidar._fields.checks import is_traced
+from jaxlidar._fields.checks import has_tracers
 from jaxlidar._jax.programs import Program
 from jaxlidar.planning.setup import Setup
 from jaxlidar.spectral.apply_optics import (
@@ -147,7 +147,7 @@ def make_batch_tracer(setup: Setup, key: PRNGKeyArray) -> BatchTracer:
     2. Make the numbers of the waveform model meanwhile.
     3. Begin to compile the programs of estimates, sums and waveforms.
     """
-    is_transformed = any(is_traced(x) for x in jax.tree.leaves((setup, key)))
+    is_transformed = has_tracers((setup, key))
     canopy = setup.scene.canopy
     traces_by_wavelength = (
         canopy is not None and canopy.is_straight

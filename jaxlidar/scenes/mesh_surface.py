@@ -29,7 +29,7 @@ from jaxlidar._fields.checks import (
     concrete,
     concrete_array,
     fixed_array,
-    is_traced,
+    has_tracers,
     kind_of,
 )
 from jaxlidar._fields.ranges import SUM_OF_FRACTIONS, Range, check_ranges
@@ -373,7 +373,7 @@ def _mesh_arrays(
         raise TypeError(
             f"mesh is {kind_of(mesh)}; admissible is a Mesh, a trimesh.Trimesh, or a tuple (vertices, faces)"
         )
-    if any(is_traced(x) for x in (vertices, faces)):
+    if has_tracers((vertices, faces)):
         raise TypeError(
             "mesh is being traced by a JAX transformation; make the MeshSurface outside, and replace its "
             "vertices within by equinox.tree_at"

@@ -4,7 +4,7 @@ import jax
 import numpy as np
 
 from jaxlidar._fields.checks import concrete, warn_user
-from jaxlidar._summary import NOTABLE_FRACTION, percent
+from jaxlidar._text import NOTABLE_FRACTION, percent
 from jaxlidar.scenes.canopy import Canopy
 from jaxlidar.scenes.surfaces import AbstractGround
 from jaxlidar.scenes.terrain import Terrain

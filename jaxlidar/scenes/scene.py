@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxlidar._fields.checks import check_kind, concrete, concrete_array, is_traced, kind_of
+from jaxlidar._fields.checks import check_kind, concrete, concrete_array, has_tracers, kind_of
 from jaxlidar._fields.ranges import Range
 from jaxlidar._text import object_text
 from jaxlidar._vectors import FAR
@@ -112,9 +112,7 @@ class Scene(eqx.Module):
 
         Triangles that lie in the ground are met before it (`trace.march.meshes`).
         """
-        if not self.plates or any(
-            is_traced(x) for x in jax.tree.leaves((self.plates, self.ground, self.meshes))
-        ):
+        if not self.plates or has_tracers((self.plates, self.ground, self.meshes)):
             return
         for i, plate in enumerate(self.plates):
             if not isinstance(plate.shape, Plane):
@@ -204,7 +202,7 @@ def check_mesh_widths(meshes: tuple[MeshSurface, ...], period: Float[Array, "2"]
     **Raises:** ValueError naming the instance, its width and the period.
     """
     period_value = None if period is None else concrete(period)
-    if period_value is None or any(is_traced(x) for x in jax.tree.leaves(meshes)):
+    if period_value is None or has_tracers(meshes):
         return
     for number, mesh in enumerate(meshes):
         boxes = mesh.bounds()

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Int, PRNGKeyArray
 
-from jaxlidar._fields.checks import check_integer, check_key, check_kind, is_traced
+from jaxlidar._fields.checks import check_integer, check_key, check_kind, has_tracers
 from jaxlidar._jax.programs import Program
 from jaxlidar._jax.threads import side_by_side
 from jaxlidar.planning.memory import memory_limit, transformed_bytes
@@ -81,7 +81,7 @@ def simulate_scenes(
     number = stack_size(scenes)
     if chunk is not None:
         chunk = check_integer("chunk", chunk)
-    is_transformed = any(is_traced(x) for x in jax.tree.leaves((lidar, scenes, key)))
+    is_transformed = has_tracers((lidar, scenes, plan, key))
     refuses = plan is not None
     if plan is None:
         if is_transformed:

@@ -18,13 +18,14 @@ from jaxlidar._fields.checks import (
     check_number,
     check_numbers,
     check_shape,
+    has_tracers,
     is_traced,
     is_within_program,
     warn_user,
 )
 from jaxlidar._jax.mesh_axes import vary_with, with_automatic_axes
 from jaxlidar._jax.threads import side_by_side
-from jaxlidar._summary import neglected_fractions, outside_message, percent, unfollowed_message
+from jaxlidar._text import outside_message, percent, unfollowed_message
 from jaxlidar.planning.memory import MAX_APPLIED_WAVELENGTHS
 from jaxlidar.planning.orders import MAX_ORDERS, orders_to_tolerance
 from jaxlidar.planning.plan import MIN_BATCHES, Plan
@@ -48,6 +49,7 @@ from jaxlidar.scenes.scene import Scene, check_kinds
 from jaxlidar.sensors.lidar import Lidar
 from jaxlidar.simulation.truth import truth_of_setup
 from jaxlidar.spectral.apply_optics import BudgetTerms, budget_excess, refuse_excess, samples_and_budget
+from jaxlidar.spectral.summary import neglected_fractions
 from jaxlidar.spectral.waveform import Waveform, open_at_first_return
 from jaxlidar.trace.response import Response, trace_device_scene
 
@@ -145,9 +147,7 @@ def simulate(
     }
     goal = _make_goal(rtol, atol, n_photons, max_seconds)
     given_plan = plan
-    is_transformed = is_within_program() or any(
-        is_traced(x) for x in jax.tree.leaves((lidar, scene, plan, key))
-    )
+    is_transformed = is_within_program() or has_tracers((lidar, scene, plan, key))
     plan = _check_or_make_plan(lidar, scene, given_plan, goal, planning, is_transformed)
     tracer = make_batch_tracer(make_setup(lidar, scene, plan), key)
     result = _run_batches(tracer, key, goal, progress, start_time)
@@ -216,10 +216,8 @@ def _check_or_make_plan(
             f"plan is given together with {', '.join(arguments)}; admissible is either: make the plan "
             "with them"
         )
-    elif not any(is_traced(x) for x in jax.tree.leaves((lidar, scene, plan))):
-        # While JAX traces a program, even what is computed of known values is traced, unless at compile time.
-        with jax.ensure_compile_time_eval():
-            check_plan(plan, lidar, scene)
+    elif not has_tracers((lidar, scene, plan)):
+        check_plan(plan, lidar, scene)
     if goal.n_photons is None:
         return plan
     # In eight batches, or in more of a size that leaves time for interrupts. Rounded up: no fewer photons
@@ -282,7 +280,7 @@ def _run_batches(
             "seconds": time.perf_counter() - start_time,
         }
         return _BatchResults(response, 1, None, None, info)
-    if any(is_traced(x) for x in jax.tree.leaves((tracer.setup, key))):
+    if has_tracers((tracer.setup, key)):
         return _trace_transformed(tracer, key)
     return _trace_batches(tracer, key, goal, progress, start_time)
 

@@ -44,6 +44,7 @@ from jaxlidar._fields.checks import (
     concrete,
     concrete_array,
     concrete_number,
+    has_tracers,
     is_traced,
 )
 from jaxlidar._jax.products import matmul
@@ -190,14 +191,14 @@ def reflectance_factor(
         if plan.config.vertical and (sun_zenith is None or float(sun_zenith) != 0):
             raise ValueError("plan is for a sun in the zenith; make one for this sun")
         # What is traced is checked by value (`make_setup`).
-        if not any(is_traced(x) for x in jax.tree.leaves((lidar, scene))):
+        if not has_tracers((lidar, scene, plan)):
             check_plan(plan, lidar, scene)
     if any(plan.config.mirrors):
         raise ValueError("a surface of the scene is a smooth mirror; admissible is any other law")
     setup = make_setup(lidar, scene, plan)
     is_hot_spot = _is_same_direction(sun_angles, view_angles) if plan.config.hotspot else False
     corner, size = _rectangle(setup.scene, area, centre)
-    is_transformed = any(is_traced(x) for x in jax.tree.leaves((setup, sun_angles, key)))
+    is_transformed = has_tracers((setup, sun_angles, key))
     common = {
         # Built here: a program that took the setup would be compiled for every number of voxels.
         "scene": build_device_scene(setup, derivatives="all" if is_transformed else "none"),

@@ -20,7 +20,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxlidar._constants import SPEED_OF_LIGHT
-from jaxlidar._fields.checks import check_kind, is_traced
+from jaxlidar._fields.checks import check_kind, has_tracers
 from jaxlidar._jax.mesh_axes import vary_with
 from jaxlidar._jax.programs import Program
 from jaxlidar._vectors import FAR, Scalar
@@ -87,7 +87,7 @@ def truth_of(lidar: Lidar, scene: Scene, *, plan: Plan | None = None) -> Truth:
     check_kind("plan", plan, Plan | None, "a Plan that jaxlidar.plan made, or None")
     if plan is None:
         plan = make_plan(lidar, scene, describe=False)
-    elif not any(is_traced(x) for x in jax.tree.leaves((lidar, scene, plan))):
+    elif not has_tracers((lidar, scene, plan)):
         check_plan(plan, lidar, scene)
     return truth_of_setup(make_setup(lidar, scene, plan))
 
@@ -95,7 +95,7 @@ def truth_of(lidar: Lidar, scene: Scene, *, plan: Plan | None = None) -> Truth:
 def truth_of_setup(setup: Setup) -> Truth:
     """Compute the truth of a lidar and a scene as they are simulated."""
     setup, plan = first_order_setup(setup), setup.plan
-    is_transformed = any(is_traced(x) for x in jax.tree.leaves(setup))
+    is_transformed = has_tracers(setup)
     scene = build_device_scene(setup)
     exact_sizes = is_transformed or scene.straight_transmittance is not None
     model = make_waveform_model(setup) if exact_sizes else make_padded_waveform_model(setup)

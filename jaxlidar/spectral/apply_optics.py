@@ -26,7 +26,6 @@ from jaxlidar._constants import SPEED_OF_LIGHT
 from jaxlidar._fields.checks import as_array
 from jaxlidar._jax.products import einsum
 from jaxlidar._jax.programs import Program
-from jaxlidar._summary import unfollowed_return
 from jaxlidar.planning.channels import channel_optics
 from jaxlidar.planning.config import KERNEL_VARIANCE
 from jaxlidar.planning.effects import allows_interreflection
@@ -591,6 +590,15 @@ def budget_stderr_of_sums(
     rules for standard errors: that of each sum stays its own.
     """
     return _energy_fractions(stderr, model)
+
+
+def unfollowed_return(unfollowed: Any, escaped: Any, returned: Any) -> Any:
+    """Return the apparent reflectance that light beyond the last order may add.
+
+    It is taken to return as much per energy as the light that escaped, but an apparent reflectance of 1 per
+    unit of energy at least, and 4 at most. `unfollowed`, `escaped`: energies. `returned`: reflectance.
+    """
+    return unfollowed * (returned / escaped.clip(1e-6)).clip(1.0, 4.0)
 
 
 def budget_of_sums(sums: ResponseSums, model: WaveformModel) -> BudgetTerms:

@@ -18,9 +18,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxlidar._fields.checks import check_index, check_range, is_traced
+from jaxlidar._fields.checks import check_index, check_range, has_tracers
 from jaxlidar._registry import detect_returns, save_result, true_returns, waveform_html
-from jaxlidar._summary import summary
 from jaxlidar.planning.setup import Setup
 from jaxlidar.sensors.lidar import Lidar
 from jaxlidar.sensors.receiver import Receiver, digitise, first_return_window
@@ -33,6 +32,7 @@ from jaxlidar.spectral.apply_optics import (
     relative_energy_samples,
     total_samples,
 )
+from jaxlidar.spectral.summary import summary
 from jaxlidar.spectral.truth_class import Truth
 from jaxlidar.trace.response import Response
 
@@ -211,13 +211,13 @@ class Waveform(eqx.Module):
         return (self[i] for i in range(len(self)))
 
     def __str__(self) -> str:
-        if any(is_traced(x) for x in (self.time, self.reflectance)):
+        if has_tracers((self.time, self.reflectance)):
             return repr(self)
         return summary(self)
 
     def _repr_html_(self) -> str | None:
         """Return HTML for notebooks: the summary and a small figure."""
-        if self.has_scenes or any(is_traced(x) for x in (self.time, self.reflectance)):
+        if self.has_scenes or has_tracers((self.time, self.reflectance)):
             return None
         return waveform_html(self)
 

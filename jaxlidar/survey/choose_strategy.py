@@ -6,7 +6,7 @@ import numpy as np
 
 from jaxlidar._constants import SPEED_OF_LIGHT
 from jaxlidar._fields.checks import concrete_array, concrete_number
-from jaxlidar._summary import percent
+from jaxlidar._text import percent
 from jaxlidar.optics.laws import AbstractMirror
 from jaxlidar.planning.local_origin import move_aim_to_origin
 from jaxlidar.planning.parallel_light import beams_are_parallel, parallel_light_bound

@@ -15,7 +15,7 @@ import numpy as np
 
 from jaxlidar._fields.checks import warn_user
 from jaxlidar._not_kept import NotKept
-from jaxlidar._summary import outside_message, unfollowed_message
+from jaxlidar._text import outside_message, unfollowed_message
 from jaxlidar.io.case import Case
 from jaxlidar.io.datasets import datasets_of
 from jaxlidar.io.groups import write_zarr_group
@@ -261,7 +261,7 @@ def _waveforms(strategy: AbstractStrategy, fields: dict[str, Any], info: dict[st
 def _warn_of_missing_light(strategy: AbstractStrategy, outside: np.ndarray, unfollowed: np.ndarray) -> None:
     """Warn if more light than the tolerance is after the record, or may be in orders that were not followed.
 
-    `outside`, `unfollowed`: (shots,), `late` and `unfollowed` of `MISSING_LIGHT`.
+    `outside`, `unfollowed`: (shots,), as in `MISSING_LIGHT`.
     """
     plan = strategy.setup.plan
     most_outside, most_unfollowed = (float(np.max(a, initial=0.0)) for a in (outside, unfollowed))

@@ -7,7 +7,7 @@ from jaxtyping import Float
 
 from jaxlidar._fields.checks import as_array, check_kind
 from jaxlidar._jax.programs import Program
-from jaxlidar._summary import NOTABLE_FRACTION, percent
+from jaxlidar._text import NOTABLE_FRACTION, percent
 from jaxlidar._vectors import FAR, vec
 from jaxlidar.planning.size_buckets import size_bucket
 from jaxlidar.scenes.canopy import Canopy

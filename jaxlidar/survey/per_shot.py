@@ -157,23 +157,38 @@ def aim_offset(lidar: Lidar, shot: ShotGeometry) -> Float[Array, "axes"]:
     return jnp.asarray(shot.position) - lidar.position
 
 
+class AimedShot(NamedTuple):
+    """One shot of a survey: its device scene and waveform model, and its random key."""
+
+    scene: DeviceScene
+    model: WaveformModel
+    key: PRNGKeyArray
+
+
 class SurveyContext(NamedTuple):
     """What all shots of a survey have in common.
 
     - `scene`: the device scene, at the aim point of the survey's middle. - `model`: the waveform model, with
-      room for more samples than the `n_samples` of the survey. - `atmosphere`: None without one.
+      room for more samples than the survey has. - `atmosphere`: None without one.
     """
 
     scene: DeviceScene
     model: WaveformModel
     atmosphere: Atmosphere | None
-    n_samples: int
+
+    def aim(self, shot: ShotGeometry, key: PRNGKeyArray) -> "AimedShot":
+        """Aim the device scene and the model at one shot; its key follows from that of the survey."""
+        lidar = lidar_of_shot(self.model.lidar, shot)
+        scene = aim_at(self.scene, lidar, aim_offset(self.model.lidar, shot))
+        model = self.model.aimed(lidar, self.atmosphere, scene.limits.start_distance)
+        # The key follows from the shot's number: its waveform does not depend on chunks or workers.
+        return AimedShot(scene, model, jax.random.fold_in(key, shot.number))
 
 
 def make_survey_context(setup: Setup) -> SurveyContext:
     """Return what all shots of a survey have in common, from the setup of its middle."""
     scene = build_device_scene(setup, derivatives="none")
-    return SurveyContext(scene, make_survey_model(setup), setup.scene.atmosphere, setup.plan.n_samples)
+    return SurveyContext(scene, make_survey_model(setup), setup.scene.atmosphere)
 
 
 def shots_to_trace(n_shots: int) -> int:
@@ -215,7 +230,14 @@ class PerShotStrategy(AbstractStrategy):
             task(
                 number,
                 trace_chunk,
-                (self.context, self._chunk_geometry(shots), self.rtol, self.kept_names, self.resolves_edges),
+                (
+                    self.context,
+                    self._chunk_geometry(shots),
+                    self.setup.plan.n_samples,
+                    self.rtol,
+                    self.kept_names,
+                    self.resolves_edges,
+                ),
                 key,
             )
             for number, shots in enumerate(self.shot_slices)
@@ -253,6 +275,7 @@ class PerShotStrategy(AbstractStrategy):
 def trace_chunk(
     context: SurveyContext,
     shots: ShotGeometry,
+    n_samples: int,
     rtol: float,
     kept_names: tuple[str, ...],
     resolves_edges: bool,
@@ -261,9 +284,7 @@ def trace_chunk(
     """Trace a chunk of shots."""
     n_shots = len(shots.number)
     results = compiled_shots(
-        context.scene,
-        context.model,
-        context.atmosphere,
+        context,
         shots.padded_to(shots_to_trace(n_shots)).in_precision(),
         np.int32(n_shots),
         key,
@@ -271,7 +292,7 @@ def trace_chunk(
         kept_names,
         resolves_edges,
     )
-    return without_padding(results, n_shots, context.n_samples, SAMPLED_ARRAYS)
+    return without_padding(results, n_shots, n_samples, SAMPLED_ARRAYS)
 
 
 class ShotBatch(NamedTuple):
@@ -289,29 +310,6 @@ class ShotBatch(NamedTuple):
             relative_energy_samples(response, model),
             budget_terms(response, model),
         )
-
-
-class AimedShot(NamedTuple):
-    """One shot of a survey: its device scene and waveform model, and its random key."""
-
-    scene: DeviceScene
-    model: WaveformModel
-    key: PRNGKeyArray
-
-
-def aim_shot(
-    scene: DeviceScene,
-    model: WaveformModel,
-    atmosphere: Atmosphere | None,
-    shot: ShotGeometry,
-    key: PRNGKeyArray,
-) -> AimedShot:
-    """Aim the device scene and the model, which are those of the survey's middle, at one shot."""
-    lidar = lidar_of_shot(model.lidar, shot)
-    aimed_model = model.aimed(lidar, atmosphere, scene.limits.start_distance)
-    aimed_scene = aim_at(scene, lidar, aim_offset(model.lidar, shot))
-    # The key follows from the shot's number: its waveform does not depend on chunks or workers.
-    return AimedShot(aimed_scene, aimed_model, jax.random.fold_in(key, shot.number))
 
 
 def _trace_shot(aimed: AimedShot, rtol: Array, kept_names: tuple[str, ...]) -> dict[str, Any]:
@@ -438,8 +436,9 @@ def _zeros(shapes: Any) -> Any:
     return jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), shapes)
 
 
-def _are_narrow(scene: DeviceScene, model: WaveformModel) -> bool:
+def _are_narrow(context: SurveyContext) -> bool:
     """Return True if shots are narrow, and of a scene whose lattices can be traced together."""
+    scene, model = context.scene, context.model
     if scene.config.follows_higher_orders or not scene.config.is_random:
         return False
     few_wavelengths = model.lidar.wavelength.size <= MAX_WAVELENGTHS_OF_NARROW
@@ -447,9 +446,7 @@ def _are_narrow(scene: DeviceScene, model: WaveformModel) -> bool:
 
 
 def _trace_narrow_shots(
-    scene: DeviceScene,
-    model: WaveformModel,
-    atmosphere: Atmosphere | None,
+    context: SurveyContext,
     shots: ShotGeometry,
     count: Array,
     key: PRNGKeyArray,
@@ -465,7 +462,7 @@ def _trace_narrow_shots(
        tolerance, then by its error.
     2. Trace the pending shots, several at a time, and replace their results.
     """
-    n_shots = len(shots.number)
+    n_shots, scene = len(shots.number), context.scene
     max_parts = MAX_BATCHES_OR_PARTS * scene.config.n_rays // RAYS_OF_PART
     error_factor = _ERROR_OF_INTERLEAVED if resolves_edges else 1.0
     # Not more than where shots are not narrow.
@@ -479,9 +476,7 @@ def _trace_narrow_shots(
 
     def trace_some(numbers: Array, n_parts: Array) -> dict[str, Any]:
         shots_of_group = jax.tree.map(lambda a: a[numbers], shots)
-        return _trace_together(
-            scene, model, atmosphere, shots_of_group, n_parts, key, kept_names, error_factor
-        )
+        return _trace_together(context, shots_of_group, n_parts, key, kept_names, error_factor)
 
     def next_round(state: tuple[Array, dict[str, Any]]) -> tuple[Array, dict[str, Any]]:
         n_parts, results = state
@@ -510,9 +505,7 @@ def _trace_narrow_shots(
 
 
 def _trace_together(
-    scene: DeviceScene,
-    model: WaveformModel,
-    atmosphere: Atmosphere | None,
+    context: SurveyContext,
     shots: ShotGeometry,
     n_parts: Int[Array, "*shots"],
     key: PRNGKeyArray,
@@ -525,6 +518,7 @@ def _trace_together(
     2. Trace them, a block of parts at a time, and add them to the tally of their lattices.
     3. Apply optics and pulse to the lattices of each shot, whose scatter tells the errors, and to their mean.
     """
+    scene, lidar = context.scene, context.model.lidar
     # Step 1. The list ends, for each shot, at:
     ends = jnp.cumsum(n_parts * MIN_BATCHES)
     n_rows, n_lattices = len(n_parts), len(n_parts) * MIN_BATCHES
@@ -535,11 +529,11 @@ def _trace_together(
         return interleaving_shifts(random_shift, MIN_BATCHES)
 
     shifts = jax.vmap(shifts_of)(shots)
-    beams = jax.vmap(lambda shot: make_beam(lidar_of_shot(model.lidar, shot)))(shots)
+    beams = jax.vmap(lambda shot: make_beam(lidar_of_shot(lidar, shot)))(shots)
     # Coordinates are relative to the aim point of the first shot. Shots that follow one another are near it;
     # at a distance, single precision places rays to 1e-7 of that.
-    offsets = jax.vmap(lambda shot: aim_offset(model.lidar, shot))(shots)
-    scene_of_first = aim_at(scene, model.lidar, offsets[0])
+    offsets = jax.vmap(lambda shot: aim_offset(lidar, shot))(shots)
+    scene_of_first = aim_at(scene, lidar, offsets[0])
     aims = jnp.pad(offsets - offsets[:1], ((0, 0), (0, 3 - offsets.shape[1])))
 
     # Step 2.
@@ -568,9 +562,9 @@ def _trace_together(
 
     # Step 3.
     def results_of(shot: ShotGeometry, sums: LatticeSums) -> dict[str, Any]:
-        aimed = aim_shot(scene, model, atmosphere, shot, key)
+        aimed = context.aim(shot, key)
         aimed = aimed._replace(model=aimed.model.for_applied_optics())
-        responses = jax.vmap(lambda s: response_of_lattice(scene, s, model.optics))(sums)
+        responses = jax.vmap(lambda s: response_of_lattice(scene, s, context.model.optics))(sums)
         values = jax.vmap(lambda response: _total_and_budget(response, aimed.model))(responses)
         moments = RunningMoments.of_batches(values, responses)
         batch = ShotBatch.of_response(moments.mean_only, aimed.model)
@@ -580,9 +574,7 @@ def _trace_together(
 
 
 def _trace_shots(
-    scene: DeviceScene,
-    model: WaveformModel,
-    atmosphere: Atmosphere | None,
+    context: SurveyContext,
     shots: ShotGeometry,
     count: Array,
     key: PRNGKeyArray,
@@ -591,13 +583,11 @@ def _trace_shots(
     resolves_edges: bool,
 ) -> dict[str, Any]:
     """Trace the first `count` shots over one device scene."""
-    if _are_narrow(scene, model):
-        return _trace_narrow_shots(
-            scene, model, atmosphere, shots, count, key, rtol, kept_names, resolves_edges
-        )
+    if _are_narrow(context):
+        return _trace_narrow_shots(context, shots, count, key, rtol, kept_names, resolves_edges)
 
     def trace(shot: ShotGeometry) -> dict[str, Any]:
-        return _trace_shot(aim_shot(scene, model, atmosphere, shot, key), rtol, kept_names)
+        return _trace_shot(context.aim(shot, key), rtol, kept_names)
 
     return map_first_shots(trace, shots, count)
 

@@ -21,10 +21,10 @@ OPTIONAL_ARRAYS = (
 )
 # Those with an axis of samples.
 SAMPLED_ARRAYS = OPTIONAL_ARRAYS[:5]
-# Further quantities of shots, (shots,), which `Waveforms` do not have. `late`, `unfollowed`: largest of all
-# wavelengths; `excess`: of the sum of the energy budget (`jaxlidar.spectral.apply_optics.budget_excess`).
+# Further quantities of shots, (shots,), which `Waveforms` do not have. `outside`, `unfollowed`: largest of
+# all wavelengths; `excess`: of the sum of the energy budget (`jaxlidar.spectral.apply_optics.budget_excess`).
 MISSING_LIGHT = {
-    "late": "fraction of the returned light that is after the end of the record",
+    "outside": "fraction of the returned light that is after the end of the record",
     "unfollowed": "fraction of the waveform that orders beyond the last may add",
 }
 EXCESS = "excess"
@@ -72,7 +72,7 @@ def make_shot_results(
         "lost": budget.lost,
         "error": errors.relative,
         "photons": photons,
-        "late": jnp.max(budget.outside / (total + budget.outside)),
+        "outside": jnp.max(budget.outside / (total + budget.outside)),
         "unfollowed": jnp.max(budget.unfollowed / total),
         EXCESS: budget_excess(budget.energy_budget, errors.energy_budget),
         **{name: optional_arrays[name] for name in kept_names},

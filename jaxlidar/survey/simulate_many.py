@@ -25,7 +25,7 @@ from jaxlidar._fields.checks import (
     check_integer,
     check_key,
     check_kind,
-    is_traced,
+    has_tracers,
     is_within_program,
     warn_user,
 )
@@ -237,7 +237,7 @@ def _check_not_transformed(survey: Survey, scene: Scene | SceneParts, key: PRNGK
     """Refuse to run within a JAX transformation. **Raises:** TypeError."""
     # Tasks run until their tolerance is met, on the host. Within a program nothing of the arguments need be
     # traced: all that is computed of them is.
-    if is_within_program() or any(is_traced(x) for x in jax.tree.leaves((survey, scene, key))):
+    if is_within_program() or has_tracers((survey, scene, key)):
         raise TypeError(
             "simulate_many cannot run inside a JAX transformation (jit, grad, vmap, ...): it traces until "
             "the tolerance of every shot is met. Call it outside, or use simulate for each shot, with plan= "

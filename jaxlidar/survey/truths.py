@@ -9,20 +9,16 @@ from jaxtyping import Array, PRNGKeyArray
 
 from jaxlidar._jax.programs import Program
 from jaxlidar._jax.workers import WorkUnit, task
-from jaxlidar.scenes.atmosphere import Atmosphere
 from jaxlidar.simulation.truth import compute_labels, first_order_setup
-from jaxlidar.spectral.apply_optics import WaveformModel
 from jaxlidar.survey.per_shot import (
     ShotGeometry,
     SurveyContext,
-    aim_shot,
     make_survey_context,
     map_first_shots,
     shot_geometry,
     shots_to_trace,
 )
 from jaxlidar.survey.strategy import AbstractStrategy, ContributionSum, Shots, without_padding
-from jaxlidar.trace.device_scene import DeviceScene
 
 # Fields of `Truth` with an axis of samples.
 _SAMPLED_FIELDS = (
@@ -58,12 +54,12 @@ class StrategyWithTruth(AbstractStrategy):
 
     def truth_tasks(self, key: PRNGKeyArray) -> list[WorkUnit]:
         """Return the tasks for the truth alone. They draw no random numbers: `key` is passed on unused."""
-        context = make_survey_context(first_order_setup(self.setup))
+        context, n_samples = make_survey_context(first_order_setup(self.setup)), self.setup.plan.n_samples
         return [
             task(
                 number,
                 truths_of_chunk,
-                (context, shot_geometry(self.survey, shots.start, shots.stop - shots.start)),
+                (context, shot_geometry(self.survey, shots.start, shots.stop - shots.start), n_samples),
                 key,
             )
             for number, shots in enumerate(self.shot_slices, self.light_strategy.n_tasks)
@@ -99,31 +95,25 @@ class StrategyWithTruth(AbstractStrategy):
         return self.light_strategy.info()
 
 
-def truths_of_chunk(context: SurveyContext, shots: ShotGeometry, key: PRNGKeyArray) -> dict[str, Any]:
+def truths_of_chunk(
+    context: SurveyContext, shots: ShotGeometry, n_samples: int, key: PRNGKeyArray
+) -> dict[str, Any]:
     """Return the fields of the `Truth` of a chunk of shots but `time`; no random numbers are drawn."""
     # The truth is that of the first order with a fixed key: `key` is unused, as every task has one.
     n_shots = len(shots.number)
     fields = _compiled_truths(
-        context.scene,
-        context.model,
-        context.atmosphere,
+        context,
         shots.padded_to(shots_to_trace(n_shots)).in_precision(),
         np.int32(n_shots),
     )
-    return without_padding(fields, n_shots, context.n_samples, _SAMPLED_FIELDS)
+    return without_padding(fields, n_shots, n_samples, _SAMPLED_FIELDS)
 
 
-def _truths_of_shots(
-    scene: DeviceScene,
-    model: WaveformModel,
-    atmosphere: Atmosphere | None,
-    shots: ShotGeometry,
-    count: Array,
-) -> dict[str, Any]:
+def _truths_of_shots(context: SurveyContext, shots: ShotGeometry, count: Array) -> dict[str, Any]:
     """Return the fields of `Truth` but `time` for the first `count` shots, over one device scene."""
 
     def truth_of_shot(shot: ShotGeometry) -> dict[str, Any]:
-        aimed = aim_shot(scene, model, atmosphere, shot, jax.random.key(0))
+        aimed = context.aim(shot, jax.random.key(0))
         fields = dict(vars(compute_labels(aimed.scene, aimed.model)))
         # All shots share it.
         del fields["time"]

@@ -13,7 +13,7 @@ from jaxlidar._constants import SPEED_OF_LIGHT
 from jaxlidar._fields.checks import check_index, check_numbers
 from jaxlidar._not_kept import NotKept
 from jaxlidar._registry import detect_returns, true_returns
-from jaxlidar._summary import NOTABLE_FRACTION, neglected_fractions, percent
+from jaxlidar._text import NOTABLE_FRACTION, percent
 from jaxlidar.io import netcdf
 from jaxlidar.io.case import Case
 from jaxlidar.io.datasets import datasets_of, keep_as_netcdf
@@ -23,6 +23,7 @@ from jaxlidar.progress import ProgressOption, shows_progress
 from jaxlidar.sampling.adaptive import StopReason
 from jaxlidar.sensors.lidar import Lidar
 from jaxlidar.sensors.survey import beam_directions
+from jaxlidar.spectral.summary import neglected_fractions
 from jaxlidar.spectral.truth_class import Truth
 from jaxlidar.spectral.waveform import Waveform
 from jaxlidar.survey.acquisition import Acquisition

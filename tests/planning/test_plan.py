@@ -264,3 +264,40 @@ def test_a_scene_far_from_every_beam_is_of_another_map(kind):
     jl.plan(jl.Lidar(position=place[:2] + 6e4), scene)
     jl.plan(jl.Lidar(sensor=(*(place[:2] - (6e5, 0.0)), 6e5), zenith=45.0, azimuth=90.0), scene)
     jl.plan(jl.Survey(jl.Lidar(), position=[(0, 0), place[:2]]), scene)
+
+
+PLANS_AS_ARGUMENTS = {
+    "simulate": (
+        lambda scene: jl.plan(LIDAR_OF_PLANS, scene, max_orders=2, n_photons=256, describe=False),
+        lambda scene, plan: jl.simulate(LIDAR_OF_PLANS, scene, key=KEY_OF_PLANS, plan=plan).reflectance,
+    ),
+    "truth_of": (
+        lambda scene: jl.plan(LIDAR_OF_PLANS, scene, max_orders=1, describe=False),
+        lambda scene, plan: jl.truth_of(LIDAR_OF_PLANS, scene, plan=plan).gap_probability,
+    ),
+    "reflectance_factor": (
+        lambda scene: jl.plan_reflectance(scene, **ANGLES, n_photons=256, max_orders=2),
+        lambda scene, plan: jl.reflectance_factor(scene, **ANGLES, key=KEY_OF_PLANS, plan=plan).reflectance,
+    ),
+}
+LIDAR_OF_PLANS, KEY_OF_PLANS = jl.Lidar(divergence=2.0, zenith=5.0), jax.random.key(0)
+ANGLES = {"sun": (30.0, 0.0), "view": (10.0, 90.0), "wavelengths": 865.0}
+
+
+@pytest.mark.parametrize("name", PLANS_AS_ARGUMENTS)
+def test_a_plan_can_be_an_argument_of_a_program(name):
+    """Its numbers are traced then; a plan for other lengths shares the program, and gives other values."""
+    make, use = PLANS_AS_ARGUMENTS[name]
+    voxels = jl.VoxelMap.from_lad(np.full((4, 4, 6), 0.5), voxel_size=0.5, origin=(-1, -1, 2))
+    canopy = jl.Canopy(voxels, leaf=jl.LeafOptics(0.4, 0.3), hotspot=False)
+    scene = jl.Scene(canopy=canopy, ground=jl.Ground(reflectance=0.3))
+    plan = make(scene)
+    program = jax.jit(lambda plan: use(scene, plan))
+    within = program(plan)
+    constant = jax.jit(lambda: use(scene, plan))()
+    np.testing.assert_allclose(within, constant, rtol=1e-3, atol=1e-6)
+    assert float(np.max(np.abs(within))) > 0.01
+    # Rays that start below the canopy: the plan does not cover the scene, which only its numbers tell.
+    short = program(plan.with_limits(start_distance=0.0))
+    assert program._cache_size() == 1
+    assert not np.allclose(short, within, rtol=1e-3, equal_nan=True)

@@ -246,7 +246,15 @@ def test_results_do_not_depend_on_which_shots_are_traced_together():
     strategy = strategy_of(narrow_shots(20), edge())
     chunks = [shot_geometry(strategy.survey, first, count) for first, count in ((0, 20), (3, 9))]
     all_shots, nine_shots = (
-        trace_chunk(strategy.context, chunk, 0.1, strategy.kept_names, strategy.resolves_edges, KEY)
+        trace_chunk(
+            strategy.context,
+            chunk,
+            strategy.setup.plan.n_samples,
+            0.1,
+            strategy.kept_names,
+            strategy.resolves_edges,
+            KEY,
+        )
         for chunk in chunks
     )
     assert np.ptp(np.asarray(all_shots.error)) > 0

@@ -4,23 +4,8 @@ from typing import Any
 
 import numpy as np
 
-# Light that a record misses is reported from this fraction of the returned light on.
-NOTABLE_FRACTION = 0.01
-
-
-def percent(fraction: float) -> str:
-    """Format a fraction in percent with two significant digits."""
-    # Rounded as text first, as "g" alone writes 100 as 1e+02.
-    return f"{float(f'{100 * fraction:.2g}'):g} %"
-
-
-def unfollowed_return(unfollowed: Any, escaped: Any, returned: Any) -> Any:
-    """Return the apparent reflectance that light beyond the last order may add.
-
-    It is taken to return as much per energy as the light that escaped, but an apparent reflectance of 1 per
-    unit of energy at least, and 4 at most. `unfollowed`, `escaped`: energies. `returned`: reflectance.
-    """
-    return unfollowed * (returned / escaped.clip(1e-6)).clip(1.0, 4.0)
+from jaxlidar._text import NOTABLE_FRACTION, percent
+from jaxlidar.spectral.apply_optics import unfollowed_return
 
 
 def neglected_fractions(wave: Any) -> tuple[float, float]:
@@ -38,22 +23,6 @@ def neglected_fractions(wave: Any) -> tuple[float, float]:
     outside = neglected - unfollowed
     fractions = unfollowed / total, outside / (total + outside)
     return float(np.max(fractions[0], initial=0.0)), float(np.max(fractions[1], initial=0.0))
-
-
-def outside_message(fraction: float, end: float, advice: str) -> str:
-    """Return the text of the warning that a fraction of the returned light comes after `end`, ns."""
-    return (
-        f"some {percent(fraction)} of the returned light is still on its way when the record ends at "
-        f"{end:.4g} ns: {advice}"
-    )
-
-
-def unfollowed_message(orders: int, fraction: float) -> str:
-    """Return the text of the warning that orders beyond the last may add a fraction of the light."""
-    return (
-        f"orders of scattering beyond {orders} may add {percent(fraction)} of the light: give "
-        "max_orders=, or fewer wavelengths at once, for which more orders are followed"
-    )
 
 
 def summary(wave: Any) -> str:
