@@ -79,6 +79,8 @@ class _Bar:
 
     def __init__(self):
         self._bar: Any = None
+        # What the bar counts: its total and unit.
+        self._counted: Any = None
 
     def __call__(self, report: Any, total: int | None = None) -> None:
         """Show a report: a `Progress`, a number that is done (of a total), or text of a further step."""
@@ -89,8 +91,12 @@ class _Bar:
                 completed = (report.rtol / max(report.error, report.rtol)) ** 2
                 done, total, unit = round(100 * completed), 100, "%"
         else:
-            done, unit = (report if isinstance(report, int) else None), "steps"
-        if self._bar is None:
+            # A number without a total is that of the step, not of those that are done.
+            done, unit = (None if total is None else report), "steps"
+        if self._counted != (total, unit):
+            # The first report, or that of the next kind of work.
+            self.close()
+            self._counted = (total, unit)
             # Imported here: a bar is shown at request alone.
             from tqdm.auto import tqdm
 

@@ -67,3 +67,28 @@ def test_the_bar_is_left_where_work_fails(capfd):
     with pytest.raises(ValueError, match="no more"):
         work(progress=True)
     assert "1/4" in capfd.readouterr().err
+
+
+def test_work_of_another_kind_has_a_bar_of_its_own(capfd):
+    @shows_progress
+    def work(*, progress=None):
+        progress(jl.Progress(60, 60, 1.0))
+        for done in (1, 120):
+            progress(jl.Progress(done, 120, 1.0, "fits"))
+
+    work(progress=True)
+    shown = capfd.readouterr().err
+    assert "60/60" in shown
+    assert "120/120" in shown
+    assert "fits" in shown
+    assert "120/60" not in shown
+
+
+def test_numbers_of_steps_that_end_in_another_order_are_counted(capfd):
+    @shows_progress
+    def work(*, progress=None):
+        for number in (2, 3, 1, 0):
+            progress(number)
+
+    work(progress=True)
+    assert "4 steps" in capfd.readouterr().err

@@ -149,9 +149,13 @@ def at_bounds(
         step, fall = _compiled_bounded_step(
             *map(jnp.asarray, (jacobian, residual, lower - values, upper - values))
         )
-    is_held = np.abs(np.asarray(step)) < end
-    falls = float(fall) > BoundedGaussNewton.atol**2
-    return AtBounds(is_at_end & is_held, is_at_end & ~is_held & falls)
+        is_held = np.abs(np.asarray(step)) < end
+        leaving = is_at_end & ~is_held
+        # The cost falls by what others move, too: by how much less does it where these stay?
+        ends = (jnp.asarray(np.where(leaving, 0.0, bound - values)) for bound in (lower, upper))
+        _, fall_of_others = _compiled_bounded_step(jnp.asarray(jacobian), jnp.asarray(residual), *ends)
+    falls = float(fall) - float(fall_of_others) > BoundedGaussNewton.atol**2
+    return AtBounds(is_at_end & is_held, leaving & falls)
 
 
 _compiled_bounded_step = jax.jit(bounded_step)

@@ -33,7 +33,7 @@ The thresholds hold for any instrument; the checks of a record need several samp
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import Any, NamedTuple, Protocol, runtime_checkable
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import ArrayLike, Float
@@ -80,39 +80,13 @@ class Verdict(NamedTuple):
         return Verdict(worse.quality, (*worse.reasons, *better.reasons))
 
 
-@runtime_checkable
-class JudgedFit(Protocol):
-    """The quantities of a fit (`Retrieval`) on which a verdict depends."""
-
-    @property
-    def values(self) -> Mapping[str, Any]: ...
-    @property
-    def stderr(self) -> Mapping[str, Any]: ...
-    @property
-    def bounds(self) -> Mapping[str, Any]: ...
-    @property
-    def at_bound(self) -> Mapping[str, Any]: ...
-    @property
-    def prior_share(self) -> Mapping[str, Any]: ...
-    @property
-    def strength(self) -> Mapping[str, Any]: ...
-    @property
-    def reduced_chi2(self) -> Any: ...
-    @property
-    def independent_samples(self) -> Any: ...
-    @property
-    def second_minimum(self) -> Any: ...
-    @property
-    def converged(self) -> Any: ...
-
-
 def _worst_of(failures: Iterable[tuple[str, str]]) -> Verdict:
     """Return the verdict of failed checks: pairs of a quality and a reason."""
     ordered = sorted(failures, key=lambda failure: -_QUALITIES.index(failure[0]))
     return Verdict(ordered[0][0] if ordered else _GOOD, tuple(reason for _, reason in ordered))
 
 
-def judge_fit(fit: JudgedFit, *, about: Sequence[str] | None = None) -> Verdict:
+def judge_fit(fit: Any, *, about: Sequence[str] | None = None) -> Verdict:
     """Judge whether a fit can be trusted, by the first table of `inversion.fit.quality`.
 
     **Arguments:**

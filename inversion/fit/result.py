@@ -107,16 +107,18 @@ class Retrieval(AbstractPosterior):
     history: tuple[float, ...] = eqx.field(static=True, default=())
 
     @property
-    def correlation(self) -> Float[np.ndarray, "*footprints n n"]:
+    def correlation(self) -> Float[Array, "*footprints n n"]:
         """Correlation of the flattened unknowns, (n, n)."""
-        covariance = np.asarray(self.covariance)
-        matrices = covariance.reshape(-1, *covariance.shape[-2:])
-        return np.stack([correlation_of(matrix) for matrix in matrices]).reshape(covariance.shape)
+        return correlation_of(self.covariance)
 
     def __len__(self) -> int:
         if np.ndim(self.reduced_chi2) == 0:
             raise TypeError("this is the retrieval of one record: it has no axis of footprints")
         return len(self.reduced_chi2)
+
+    def __bool__(self) -> bool:
+        # Not by the length, which the retrieval of one record does not have.
+        return True
 
     def __getitem__(self, footprint: int) -> "Retrieval":
         i = check_index("footprint", footprint, len(self))

@@ -55,8 +55,10 @@ Econometrica 48, 817; averaging kernel: Rodgers (2000), Inverse Methods for Atmo
 Newton decrement: Boyd and Vandenberghe (2004), Convex Optimization, section 9.5.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
@@ -197,16 +199,19 @@ def _covariance_at_bounds(
     return conditional
 
 
-def correlation_of(covariance: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"]:
-    """Return the correlation matrix. Unknowns of infinite or zero variance are uncorrelated with others."""
-    std = np.sqrt(np.diag(covariance))
-    is_regular = np.isfinite(std) & (std > 0)
-    safe_std = np.where(is_regular, std, 1.0)
-    finite_covariance = np.where(np.isfinite(covariance), covariance, 0.0)
-    correlation = np.where(np.outer(is_regular, is_regular), finite_covariance, 0.0)
-    correlation = correlation / np.outer(safe_std, safe_std)
-    np.fill_diagonal(correlation, 1.0)
-    return correlation
+def correlation_of(covariance: Any) -> Any:
+    """Return the correlation matrices (..., n, n) of covariances, arrays of NumPy or of JAX.
+
+    Unknowns of infinite or zero variance are uncorrelated with others.
+    """
+    xp = jnp if isinstance(covariance, jax.Array) else np
+    std = xp.sqrt(xp.diagonal(covariance, axis1=-2, axis2=-1))
+    is_regular = xp.isfinite(std) & (std > 0)
+    safe_std = xp.where(is_regular, std, 1.0)
+    are_regular = is_regular[..., :, None] & is_regular[..., None, :] & xp.isfinite(covariance)
+    correlation = xp.where(are_regular, covariance, 0.0) / (safe_std[..., :, None] * safe_std[..., None, :])
+    is_diagonal = xp.broadcast_to(xp.eye(std.shape[-1], dtype=bool), correlation.shape)
+    return xp.where(is_diagonal, 1.0, correlation)
 
 
 class ResidualCovariance(NamedTuple):

@@ -36,7 +36,7 @@ from jaxtyping import Array, Float, Int
 from inversion.fit.quality import Verdict, judge_record
 from inversion.metrics.records import refuse_baseline
 from jaxlidar.extend import as_array, as_numpy, check_integer, check_number, check_range, even_step
-from jaxlidar.survey.records import size_bucket
+from jaxlidar.survey.records import record_bucket
 
 # Subdivisions of a bin, where a Gaussian is cut (in standard deviations), and shots computed at a time.
 _SUBDIVISIONS, _CUT, _CHUNK = 4, 2.5, 64
@@ -191,7 +191,7 @@ def pad_shots(shots: list[Any], *, size: int | None = None, is_checked: bool = F
     """
     n_samples = np.array([np.size(shot.waveform) for shot in shots], int)
     top, step = np.empty((2, len(shots)))
-    sizes = np.array([size_bucket(int(count)) for count in n_samples], int)
+    sizes = np.array([record_bucket(int(count)) for count in n_samples], int)
     if size is not None:
         sizes = np.full_like(sizes, size)
     batches = []
@@ -387,7 +387,7 @@ def _record_features(
     size = records.shape[1] * _SUBDIVISIONS
     half = kernels.shape[1] // 2
     # Long enough that the convolution does not wrap around.
-    padded = size_bucket(size + kernels.shape[1])
+    padded = record_bucket(size + kernels.shape[1])
     kernel_spectra = jnp.fft.rfft(kernels, padded)
     position = jnp.arange(size)
 

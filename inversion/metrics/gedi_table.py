@@ -64,7 +64,7 @@ from jaxlidar.io.gedi import IncompleteShot, read_gedi_rows
 from jaxlidar.io.store import check_store_path
 from jaxlidar.io.tables import ColumnAxis
 from jaxlidar.progress import ProgressOption, shows_progress
-from jaxlidar.survey.records import size_bucket
+from jaxlidar.survey.records import record_bucket
 
 # Setting groups of the product, and shots that are computed at once.
 _GROUPS, _BATCH = range(1, 7), 64
@@ -205,7 +205,7 @@ def gedi_table(
     verdicts = [_verdict_before(row, refusal) for row, refusal in zip(rows, refusals)]
     # Shots whose records can be computed; the others keep their rows of NaN.
     usable = np.array([i for i, refusal in enumerate(refusals) if refusal is None], int)
-    padded_size = size_bucket(max((np.size(rows[i].waveform) for i in usable), default=1))
+    padded_size = record_bucket(max((np.size(rows[i].waveform) for i in usable), default=1))
     structure = _CanopyStructure(layer_edges, float(reflectance_ratio), float(projection), float(clumping))
     estimates = _empty_estimates(len(rows), layer_edges.size - 1)
     for first in range(0, usable.size, _BATCH):

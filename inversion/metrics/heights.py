@@ -45,7 +45,7 @@ from inversion.metrics.records import (
     vertex_offset,
 )
 from jaxlidar.extend import as_array, check_range
-from jaxlidar.survey.records import Pulse, over_shots, size_bucket
+from jaxlidar.survey.records import Pulse, over_shots, record_bucket
 
 # Sigma clipping: largest noise in standard deviations, and number of iterations.
 _CLIP, _CLIP_ITERATIONS = 3.0, 5
@@ -272,7 +272,7 @@ def _smooth(y: Array, kernel: Array) -> Array:
     if kernel.size == 1:
         return y
     # Long enough that the convolution does not wrap around.
-    size, half = size_bucket(y.size + kernel.size), kernel.size // 2
+    size, half = record_bucket(y.size + kernel.size), kernel.size // 2
     return jnp.fft.irfft(jnp.fft.rfft(y, size) * jnp.fft.rfft(kernel, size), size)[half : half + y.size]
 
 

@@ -23,6 +23,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, ArrayLike, Float
 
+from jaxlidar import SPEED_OF_LIGHT
 from jaxlidar.extend import check_range, concrete
 from jaxlidar.survey.records import (
     EvenAxis,
@@ -31,12 +32,12 @@ from jaxlidar.survey.records import (
     divide_by_largest,
     even_axis,
     pad_to,
+    record_bucket,
     sample_pulse,
-    size_bucket,
 )
 
 # Metres of height per ns of two-way travel at nadir: half the speed of light.
-METRES_PER_NS = 0.149896229
+METRES_PER_NS = 0.5 * SPEED_OF_LIGHT
 # Width of the smoothing over that of the Gaussian of the pulse's peak and area.
 _SMOOTHING = 0.83
 # Median of the absolute value of a normal variable of unit variance.
@@ -91,7 +92,7 @@ def pad_record(height: ArrayLike, power: ArrayLike) -> PaddedRecord:
     heights = even_axis("height", height, decreasing=True)
     samples, magnitude = divide_by_largest(power, "power")
     bins = y_shape[-1]
-    return PaddedRecord(heights, pad_to(samples, size_bucket(bins)), jnp.asarray(bins), magnitude)
+    return PaddedRecord(heights, pad_to(samples, record_bucket(bins)), jnp.asarray(bins), magnitude)
 
 
 def check_background(record: PaddedRecord, noise: Array | None, threshold: Array | None = None) -> None:

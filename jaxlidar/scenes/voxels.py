@@ -16,6 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
+from scipy import ndimage
 
 from jaxlidar._fields.checks import (
     as_array,
@@ -241,12 +242,8 @@ class VoxelMap(eqx.Module):
         is_occupied = self.mean_extinction() > 0
         if not is_occupied.any():
             is_occupied[0, 0, 0] = True
-        ranges, first = [], []
-        for axis in range(3):
-            (layers,) = np.nonzero(is_occupied.any(axis=tuple(k for k in range(3) if k != axis)))
-            ranges.append(slice(layers[0], layers[-1] + 1))
-            first.append(layers[0])
-        occupied = tuple(ranges)
+        (occupied,) = ndimage.find_objects(is_occupied.astype(np.int8))
+        first = [layers.start for layers in occupied]
         return VoxelMap(
             None if self.leaf is None else self.leaf[occupied],
             None if self.bark is None else self.bark[occupied],

@@ -199,6 +199,10 @@ class Waveform(eqx.Module):
             raise TypeError("this is the waveform of one scene: it has no axis of scenes")
         return len(self.reflectance)
 
+    def __bool__(self) -> bool:
+        # Not by the length, which the waveform of one scene does not have.
+        return True
+
     def __getitem__(self, scene: int) -> "Waveform":
         i = check_index("scene", scene, len(self))
         # `jax.vmap` gives these, too, an axis of scenes.

@@ -61,8 +61,8 @@ from jaxlidar.survey.records import (
     even_axis,
     over_shots,
     pad_to,
+    record_bucket,
     sample_pulse,
-    size_bucket,
 )
 
 _SOLVER = optx.LevenbergMarquardt(rtol=1e-3, atol=1e-3)
@@ -188,7 +188,7 @@ def gaussian_decomposition(
     times = even_axis("time", time)
     y, magnitude = divide_by_largest(power, "power", noise)
     sigma = _over_magnitude(noise, magnitude)
-    padded, weight = _padded_to(size_bucket(bins), y, sigma)
+    padded, weight = _padded_to(record_bucket(bins), y, sigma)
     arrays = {"power": padded, "weight": weight, "step": jnp.asarray(times.step, y.dtype)}
     if pulse is None:
         assert width is not None
@@ -303,7 +303,7 @@ def _gaussian_shape(size: int, pulse_width: Array) -> _EchoShape:
 def _copy_shape(size: int, pulse: Array) -> _EchoShape:
     """Copies of a pulse on `size` bins, shifted and broadened in the Fourier domain."""
     # Long enough that a copy at either end does not wrap around.
-    padded = size_bucket(size + pulse.size)
+    padded = record_bucket(size + pulse.size)
     time_zero = pulse.size // 2
     from_zero = jnp.roll(jnp.pad(pulse, (0, padded - pulse.size)), -time_zero)
     spectrum, square_spectrum = jnp.fft.rfft(from_zero), jnp.fft.rfft(from_zero**2)
@@ -326,7 +326,7 @@ def _copy_shape(size: int, pulse: Array) -> _EchoShape:
 
 def _weight_with_pulse_error(y: Array, weight: Array, pulse: Array, pulse_error: Array) -> Array:
     """Lower the weights of samples by the errors of the pulse near them (see the module's docstring)."""
-    size = size_bucket(y.size + pulse.size)
+    size = record_bucket(y.size + pulse.size)
     half, energy = pulse.size // 2, jnp.where(weight > 0, y * y, 0.0)
     box = jnp.ones(pulse.size, y.dtype)
     # Moving sum of the energy over a pulse's length; rounding of the transforms can make it negative.

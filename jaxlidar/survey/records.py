@@ -15,7 +15,7 @@ from jax import lax
 from jaxtyping import Array, ArrayLike, Float
 
 from jaxlidar._fields.checks import as_array, check_range, concrete, even_step
-from jaxlidar.planning.size_buckets import size_bucket as _size_bucket
+from jaxlidar.planning.size_buckets import size_bucket
 from jaxlidar.sensors.pulse import AbstractPulse
 
 # The ends of a pulse are cut where its samples stay below this fraction of its peak.
@@ -30,9 +30,9 @@ Pulse = Float[ArrayLike, "... lags"] | AbstractPulse
 # -- programs for many sizes and many shots ------------------------------------------------------------
 
 
-def size_bucket(count: int) -> int:
+def record_bucket(count: int) -> int:
     """Smallest of 64, 96, 128, 192, 256, 384, ... that is not below `count`."""
-    return _size_bucket(max(count, 64))
+    return size_bucket(max(count, 64))
 
 
 def pad_to(samples: Array, size: int) -> Array:
@@ -220,6 +220,6 @@ def sample_pulse(pulse: Pulse | None, step: ArrayLike) -> Float[Array, "... padd
         half = max(middle - int(bright_lags[0]), int(bright_lags[-1]) - middle)
         samples = samples[..., middle - half : middle + half + 1]
     half = samples.shape[-1] // 2
-    padding = size_bucket(half) - half
+    padding = record_bucket(half) - half
     samples = jnp.pad(samples, [(0, 0)] * (samples.ndim - 1) + [(padding, padding)])
     return samples / jnp.max(samples, axis=-1, keepdims=True)

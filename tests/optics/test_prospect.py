@@ -9,6 +9,7 @@ import prosail
 import pytest
 from scipy.optimize import brentq
 
+from jaxlidar.optics import prospect
 from jaxlidar.optics.coefficients import TRAITS, load_coefficients, shipped
 from jaxlidar.optics.leaf_surface import leaf_surface
 from jaxlidar.optics.plate_model import plate_model
@@ -156,7 +157,8 @@ def random_leaves(n):
 
 
 @pytest.mark.slow
-def test_batches(precision):
+def test_batches(precision, monkeypatch):
+    monkeypatch.setattr(prospect, "_LEAVES_AT_ONCE", 3)
     leaves, wavelengths = random_leaves(7), np.array([450.0, 700.5, 1550.0])
     R, T = jax.jit(lambda leaves: leaves(wavelengths))(leaves)
     jacobian = jax.jit(lambda leaves: leaves.jacobian(wavelengths, batch_size=3))

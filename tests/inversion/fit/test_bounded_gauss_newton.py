@@ -7,7 +7,7 @@ import optimistix as optx
 import pytest
 from scipy import optimize
 
-from inversion.fit.bounded_gauss_newton import BoundedGaussNewton
+from inversion.fit.bounded_gauss_newton import BoundedGaussNewton, at_bounds
 
 # No step counts as small, unless rounding is.
 EXACT = BoundedGaussNewton(atol=1e-4, rtol=1e-4, limits=(1e-4,) * 20)
@@ -100,3 +100,12 @@ def test_noise_of_the_residuals_ends_a_fit_where_no_step_improves_it():
         steps.append(int(solution.stats["num_steps"]))
     assert lengths[0] < 0.3
     assert steps[0] < steps[1]
+
+
+@pytest.mark.parametrize(("residual", "leaving"), [((-1e-5, -0.4), False), ((-0.4, -1e-5), True)])
+def test_an_unknown_leaves_its_bound_for_its_own_misfit(residual, leaving):
+    """The cost falls by the step of both unknowns; the first is at its bound, the second within."""
+    values, lower, upper = np.array([0.0, 0.5]), np.zeros(2), np.ones(2)
+    found = at_bounds(values, np.array(residual), np.eye(2), lower, upper)
+    assert found.leaving.tolist() == [leaving, False]
+    assert not found.held.any()
