@@ -84,8 +84,9 @@ _RAYS_SIDE_BY_SIDE = 512
 # Batches of a shot follow one another, so that steps could be as small as one. The error is looked at after
 # every fourth: an estimate that stops at the first moment at which it seems precise is wrong more often.
 _BATCH_STEPS = StepRule(max_growth=1.0, min_step=4)
-# Lattices of at most this many rays are those of narrow footprints ...
-_NARROW_RAYS = 64
+# Footprints whose lattices need at most this many rays are narrow: they meet a few columns of voxels. Wider
+# ones would trace as many rays in the end. Lattices of narrow ones ...
+_NARROW_RAYS = 256
 # ... which are traced in parts of this many rays, for this many shots together ...
 RAYS_OF_PART, _SHOTS_AT_ONCE = 8, 8
 # ... with as many parts in the first round that about three rays of all lattices meet what covers the
@@ -436,8 +437,8 @@ def _zeros(shapes: Any) -> Any:
     return jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), shapes)
 
 
-def _are_narrow(context: SurveyContext) -> bool:
-    """Return True if shots are narrow, and of a scene whose lattices can be traced together."""
+def begins_with_few_rays(context: SurveyContext) -> bool:
+    """Return True if shots are narrow, of a scene whose lattices can be traced together, in parts."""
     scene, model = context.scene, context.model
     if scene.config.follows_higher_orders or not scene.config.is_random:
         return False
@@ -583,7 +584,7 @@ def _trace_shots(
     resolves_edges: bool,
 ) -> dict[str, Any]:
     """Trace the first `count` shots over one device scene."""
-    if _are_narrow(context):
+    if begins_with_few_rays(context):
         return _trace_narrow_shots(context, shots, count, key, rtol, kept_names, resolves_edges)
 
     def trace(shot: ShotGeometry) -> dict[str, Any]:

@@ -10,7 +10,13 @@ import pytest
 
 import jaxlidar as jl
 from jaxlidar.survey.choose_strategy import choose_strategy
-from jaxlidar.survey.per_shot import aim_offset, lidar_of_shot, shot_geometry, trace_chunk
+from jaxlidar.survey.per_shot import (
+    aim_offset,
+    begins_with_few_rays,
+    lidar_of_shot,
+    shot_geometry,
+    trace_chunk,
+)
 from jaxlidar.trace.device_scene import aim_at, build_device_scene
 from jaxlidar.trace.first.first_order import first_order
 from jaxlidar.trace.first.footprint import RaySlice, fibonacci_disc, interleaving_shifts, make_beam
@@ -144,6 +150,26 @@ def terrain_under(scene: jl.Scene) -> jl.Scene:
 
 def strategy_of(survey: jl.Survey, scene: jl.Scene):
     return choose_strategy(survey, scene, rtol=0.2, max_orders=1, window=None, shared=None)
+
+
+def test_footprints_that_meet_a_few_columns_begin_with_few_rays():
+    """The cost of a shot grows with the voxels that it meets, without a step where these are small."""
+    lidar = jl.Lidar(altitude=1000.0, divergence=0.3, pulse=jl.GaussianPulse(fwhm=4.0))
+    survey = jl.Survey(lidar, [(10.0, 10.0)])
+    crown = edge()
+    leaf = np.repeat(np.asarray(crown.canopy.voxels.leaf), 2, axis=0)
+    for axis in (1, 2):
+        leaf = np.repeat(leaf, 2, axis=axis)
+    fine = jl.VoxelMap.from_extinction(leaf=leaf, voxel_size=0.5)
+    fine_crown = dataclasses.replace(crown, canopy=dataclasses.replace(crown.canopy, voxels=fine))
+    strategies = [
+        choose_strategy(survey, scene, rtol=0.05, max_orders=1, window=None, shared=False)
+        for scene in (crown, fine_crown)
+    ]
+    assert [begins_with_few_rays(strategy.context) for strategy in strategies] == [True, True]
+    # Footprints of 3 m at 1 %, whose lattices need hundreds of rays.
+    wide = choose_strategy(shots(), fine_crown, rtol=0.01, max_orders=1, window=None, shared=False)
+    assert not begins_with_few_rays(wide.context)
 
 
 def with_fine_terrain(scene: jl.Scene) -> jl.Scene:
