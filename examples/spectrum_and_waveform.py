@@ -132,7 +132,7 @@ def make_models() -> tuple[dict[str, Callable[[jax.Array, jax.Array], jax.Array]
     passive = {**ANGLES, "wavelengths": wavelengths}
     spectrum_plan = jl.plan_reflectance(scene_at(truth, soil), n_photons=PHOTONS, **passive)
     lidar_scene = scene_at(truth, lidar_soil)
-    plan = jl.plan(lidar, lidar_scene, window=WINDOW, n_photons=PHOTONS)
+    plan = jl.plan(lidar, lidar_scene, window=WINDOW, n_photons=8 * PHOTONS)
 
     def bands(x: jax.Array, key: jax.Array) -> jax.Array:
         factor = jl.reflectance_factor(scene_at(x, soil), plan=spectrum_plan, key=key, **passive)

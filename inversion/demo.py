@@ -28,7 +28,7 @@ NOISE_FRACTION, NOISE_FLOOR = 0.03, 0.01
 # Recording window in ns: from 17 m above the ground to 9 m below, for multiple scattering in the crown.
 WINDOW = (-115.0, 60.0)
 # Photons and rays of each simulation of the retrieval.
-FIT_PHOTONS, FIT_RAYS = 16384, 2048
+FIT_PHOTONS, FIT_RAYS = 16384, 256
 # Dots per inch of the figures.
 RESOLUTION = 130
 

@@ -15,7 +15,7 @@ def test_value_and_gradient_are_lowered_for_cpu_cuda_and_tpu():
         return jl.Scene(canopy=jl.Canopy(voxels, leaf=jl.LeafOptics(0.45, 0.4)), ground=ground)
 
     lad, key = jnp.full((2, 2, 2), 0.2), jax.random.key(0)
-    plan = jl.plan(lidar, scene(lad), max_orders=2, n_photons=64, window=(-20.0, 20.0))
+    plan = jl.plan(lidar, scene(lad), max_orders=2, n_photons=512, window=(-20.0, 20.0))
 
     def misfit(lad, key):
         return jnp.sum(jl.simulate(lidar, scene(lad), plan=plan, key=key).reflectance ** 2)

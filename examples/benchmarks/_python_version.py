@@ -57,7 +57,7 @@ def main() -> None:
         {
             "simulate to 1 %": simulation,
             f"{rays_only.n_rays} rays, first order": lambda: traced(scene, rays_only),
-            f"{photons_only.n_photons} photons, higher orders": lambda: traced(scene, photons_only),
+            f"{photons_only.photons_traced} photons, higher orders": lambda: traced(scene, photons_only),
             "the same, reverse=True": lambda: traced(scene, photons_only, True),
             "Jacobian in height and density": lambda: jacobian(heights),
             "Jacobian, reverse=True": lambda: reverse_jacobian(heights),

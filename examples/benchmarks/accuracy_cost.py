@@ -267,7 +267,7 @@ def deterministic(all_cases: dict[str, AccuracyCase]) -> dict[str, dict]:
 
 def random_knobs(name: str, case: AccuracyCase, batches: int, photons: int) -> dict:
     """Return errors and times of the default, one deposit a flight, fewer orders and analog photons."""
-    size = {"n_photons": photons, "n_rays": 1024}
+    size = {"n_photons": 8 * photons, "n_rays": 1024}
     plan = case.plan(**size)
     plans = {"default": plan, "one deposit a flight": plan.with_config(deposits_per_flight=1)}
     long = run_batches(case, 8 * batches, case.plan(**size, bin_width=0.25), seed=10**6)

@@ -64,7 +64,13 @@ def measure_of(plan: jl.Plan):
 def side_by_side(orders: int, counts: list[int], rounds: int, gradient: bool = False) -> list[dict]:
     """Time traces of several keys under `jax.vmap`."""
     plan = jl.plan(
-        LIDAR, crown(), max_orders=orders, window=WINDOW, n_photons=PHOTONS, n_rays=PHOTONS, footprint="fixed"
+        LIDAR,
+        crown(),
+        max_orders=orders,
+        window=WINDOW,
+        n_photons=8 * PHOTONS,
+        n_rays=PHOTONS,
+        footprint="fixed",
     )
     extinction = jnp.asarray(crown().canopy.voxels.leaf)
     function = jax.grad(measure_of(plan)) if gradient else measure_of(plan)

@@ -40,7 +40,7 @@ def problem(side: int, orders: int, photons: int, rays: int):
         )
 
     window = (-150.0, 150.0)
-    plan = jl.plan(lidar, scene(lad), max_orders=orders, n_photons=photons, n_rays=rays, window=window)
+    plan = jl.plan(lidar, scene(lad), max_orders=orders, n_photons=8 * photons, n_rays=rays, window=window)
     factors = jnp.sin(jnp.arange(plan.n_samples))
 
     def simulate(lad, key):

@@ -60,7 +60,7 @@ def main() -> None:
         lidar,
         scene_at(*START, extinction),
         max_orders=ORDERS,
-        n_photons=arguments.photons // MIN_BATCHES,
+        n_photons=arguments.photons,
         n_rays=8192 // MIN_BATCHES,
     )
 

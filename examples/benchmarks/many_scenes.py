@@ -54,7 +54,7 @@ def main() -> None:
     arguments = options("Cost of many scenes.", scenes=10_000)
     rows = [{"orders": 1, "photons": 0, **cost(stands(arguments.scenes), max_orders=1)}]
     for photons in PHOTONS:
-        settings = {"max_orders": MAX_ORDERS, "n_photons": photons}
+        settings = {"max_orders": MAX_ORDERS, "n_photons": 8 * photons}
         rows.append(
             {
                 "orders": MAX_ORDERS,

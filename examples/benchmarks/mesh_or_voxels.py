@@ -121,7 +121,7 @@ def simulations(footprint: Footprint, scene: jl.Scene, key: jax.Array, runs: int
         # A tolerance that eight batches meet.
         rtol=0.9,
         max_orders=ORDERS,
-        n_photons=photons // 8,
+        n_photons=photons,
         n_rays=photons // 4,
         window=WINDOW,
         describe=False,

@@ -57,7 +57,7 @@ def main() -> None:
     scenes = {name: jl.Scene(canopy=canopy, ground=ground, meshes=m) for name, m in meshes().items()}
     scenes["1,000 triangles alone"] = jl.Scene(ground=ground, meshes=meshes()["1,000 triangles"])
     # A tolerance that eight batches meet: all scenes trace the same photons.
-    choices = {"n_photons": arguments.photons // 8, "max_orders": ORDERS}
+    choices = {"n_photons": arguments.photons, "max_orders": ORDERS}
     plans = {name: jl.plan(lidar, scene, rtol=0.9, **choices) for name, scene in scenes.items()}
 
     def simulation(name):

@@ -53,7 +53,7 @@ def run_jaxlidar(extinction: np.ndarray, repeats: int) -> dict:
         canopy = jl.Canopy(voxels, leaf=jl.Isotropic(albedo=ALBEDO), hotspot=False)
         return jl.Scene(canopy=canopy)
 
-    plan = jl.plan(lidar, scene(extinction), max_orders=ORDERS, n_photons=PHOTONS // 8, window=WINDOW)
+    plan = jl.plan(lidar, scene(extinction), max_orders=ORDERS, n_photons=PHOTONS, window=WINDOW)
 
     def total(k, key):
         return jnp.sum(jl.simulate(lidar, scene(k), plan=plan, key=key).reflectance)

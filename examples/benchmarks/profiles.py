@@ -118,7 +118,7 @@ def recorded(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return waveforms without noise, their times and heights."""
     steepest = stand(np.ones(LAYERS), 38.0 if columns > 1 else 0.0, columns=columns)
-    size = {"n_rays": 4096, "n_photons": 2**18} if columns > 1 else {"n_rays": 8, "n_photons": 8}
+    size = {"n_rays": 4096, "n_photons": 2**21} if columns > 1 else {"n_rays": 8, "n_photons": 64}
     plan = jl.plan(LIDAR, steepest, max_orders=orders, window=window, **size)
     waves = []
     for i, stand_values in enumerate(stands):

@@ -100,7 +100,7 @@ def plan_of(photons: int, **changes) -> jl.Plan:
     low, high = ({name: float(b[i]) for name, (b, _) in RANGES.items()} for i in (0, 1))
     largest = scene_of({**high, "ground height": low["ground height"]})
     return jl.plan(
-        LIDAR, largest, max_orders=ORDERS, window=WINDOW, n_photons=photons, **{"n_rays": 64, **changes}
+        LIDAR, largest, max_orders=ORDERS, window=WINDOW, n_photons=8 * photons, **{"n_rays": 64, **changes}
     )
 
 

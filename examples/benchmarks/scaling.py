@@ -39,7 +39,7 @@ def crown(n: int) -> jl.Scene:
 def cost(scene: jl.Scene, photons: int, rays: int) -> tuple[float, int, float]:
     """Return seconds and bytes of a batch, and its apparent reflectance."""
     plan = jl.plan(
-        LIDAR, scene, max_orders=ORDERS, window=WINDOW, n_photons=photons, n_rays=rays, describe=False
+        LIDAR, scene, max_orders=ORDERS, window=WINDOW, n_photons=8 * photons, n_rays=rays, describe=False
     )
 
     def batch(scene, key):

@@ -277,7 +277,7 @@ def one_by_one(survey: jl.Survey, records: dict, n_layers: int) -> tuple[dict, i
         noise=records["noise"],
         time=records["time"],
         max_orders=1,
-        n_rays=128,
+        n_rays=16,
     )
     fits = inversion.retrieve_many(problem, key=jax.random.key(2), starts=3)
     return {name: np.asarray(a) for name, a in fits.values.items()}, int(np.sum(~np.asarray(fits.converged)))

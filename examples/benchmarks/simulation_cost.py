@@ -65,7 +65,7 @@ def split(scene: jl.Scene, rounds: int) -> dict[str, float]:
         race(
             {
                 f"first order, {plan.n_rays} rays": lambda: first(scene, key),
-                f"higher orders, {plan.n_photons} photons": lambda: higher(scene, key),
+                f"higher orders, {plan.photons_traced} photons": lambda: higher(scene, key),
                 "apply optics": lambda: apply_optics(response, scene),
                 "trace": lambda: all_orders(scene, key),
             },

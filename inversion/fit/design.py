@@ -422,8 +422,7 @@ def design(
     - `max_steps`: steps of the optimiser from each start. Default 100.
     - `key`: a JAX random key, for photons and starts. Default None: `jax.random.key(0)`; all designs are
       compared with the same random numbers.
-    - `max_orders`, `n_rays`: of the simulation of each scene, as for `plan`. Default None.
-    - `n_photons`: photons of all batches of a scene together. Default 65536.
+    - `max_orders`, `n_rays`, `n_photons`: of the simulation of each scene, as for `plan`.
 
     **Returns:** a `Design`.
 
@@ -570,7 +569,7 @@ def _plan(
     longest pulse, and paths those of the widest beam.
     """
     options: dict[str, Any] = {
-        "n_photons": -(-check_integer("n_photons", n_photons, N_BATCHES) // N_BATCHES),
+        "n_photons": check_integer("n_photons", n_photons, N_BATCHES),
         "n_rays": n_rays,
         "histories": True,
         "max_orders": max_orders,

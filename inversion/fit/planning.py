@@ -7,7 +7,7 @@ not all corners are examined (`corner_cases`).
 """
 
 import itertools
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -20,7 +20,7 @@ from jaxlidar.extend import check_integer, check_kind
 from jaxlidar.planning.effects import effects_of_family
 from jaxlidar.planning.plan import MIN_BATCHES
 from jaxlidar.planning.plan_check import check_pulse, check_reach
-from jaxlidar.planning.scene_family import union_plan
+from jaxlidar.planning.scene_family import plan_cases
 
 # Up to this many unknowns that change the response, every corner of the bounds is examined: 2^4 of them.
 _MAX_UNKNOWNS_FOR_ALL_CORNERS = 4
@@ -28,22 +28,16 @@ _MAX_UNKNOWNS_FOR_ALL_CORNERS = 4
 N_BATCHES = MIN_BATCHES
 # Bytes up to which fits keep scattering histories.
 MAX_MEMORY_OF_HISTORIES = 1e9
-# Photons and rays of all batches together, unless they or a plan are given.
-N_PHOTONS, N_RAYS = 65536, 8192
+# Photons of all batches together and rays of each, unless they or a plan are given.
+N_PHOTONS, N_RAYS = 65536, 1024
 
 
-class TraceSizes(NamedTuple):
-    """Size of a simulation: photons and rays of a batch, and orders of scattering (None: by the albedos)."""
-
-    photons_per_batch: int
-    rays_per_batch: int
-    max_orders: int | None
-
-
-def trace_sizes(
+def size_arguments(
     n_photons: int | None, n_rays: int | None, max_orders: int | None, plan: Plan | None
-) -> TraceSizes:
-    """Return the size of a simulation from the arguments of `Problem`.
+) -> dict[str, Any]:
+    """Return the arguments of `plan` for the size of a simulation, from those of `Problem`.
+
+    With a plan, which has its own, they are None.
 
     **Raises:** ValueError for less than one photon or ray in a batch, and for a plan that is given together
     with a size, which it has already. TypeError for what is no plan.
@@ -56,9 +50,12 @@ def trace_sizes(
             f"plan is given together with {', '.join(conflicting)}; admissible is either: make the plan with "
             "them"
         )
+    if plan is not None:
+        return arguments
     photons = check_integer("n_photons", N_PHOTONS if n_photons is None else n_photons, N_BATCHES)
-    rays = check_integer("n_rays", N_RAYS if n_rays is None else n_rays, N_BATCHES)
-    return TraceSizes(photons // N_BATCHES, rays // N_BATCHES, max_orders)
+    rays = check_integer("n_rays", N_RAYS if n_rays is None else n_rays)
+    # Rounded up, as in the plan: a number that the batches have already is no other problem.
+    return {"n_photons": N_BATCHES * -(-photons // N_BATCHES), "n_rays": rays, "max_orders": max_orders}
 
 
 def corner_cases(lidar: Lidar, scene: Scene, unknowns: list[BoundUnknown]) -> list[tuple[Lidar, Scene]]:
@@ -94,19 +91,16 @@ def plan_for_bounds(
     scene: Scene,
     unknowns: list[BoundUnknown],
     time: Float[np.ndarray, " samples"],
-    sizes: TraceSizes,
+    *,
+    max_orders: int | None,
+    **sizes: int,
 ) -> Plan:
     """Plan the starting scene, with loops and fine time bins long enough for all `corner_cases`.
 
     Fine time bins are those in which light is collected; `time` has the samples of the record. With
     a `Survey` the plan serves all of its shots.
 
-    Scatterer channels, orders and step lengths are those of the starting scene.
-
-    1. Plan the starting scene; all plans share its orders, bin width and step length. Where the pulse is
-       unknown, the width is that of the shortest one.
-    2. Plan every corner.
-    3. Take the union of the fine time bins, and the largest of each loop's length.
+    Orders, and whether histories are kept, are those of the starting scene.
 
     **Raises:** ValueError for an inadmissible corner, such as a canopy that reaches above the sensor.
     """
@@ -115,36 +109,24 @@ def plan_for_bounds(
     # A thousandth of a sample keeps the last one in a window whose end is rounded.
     window = (float(time[0]), float(time[0]) + (time.size - 1 + 1e-3) * interval)
     cases = corner_cases(lidar, scene, unknowns)
-    scenes = [case_scene for _, case_scene in cases]
     common: dict[str, Any] = {
         "window": window,
-        "n_photons": sizes.photons_per_batch,
-        "n_rays": sizes.rays_per_batch,
-        "describe": False,
-        "effects": effects_of_family(scenes),
+        **sizes,
+        "effects": effects_of_family([case_scene for _, case_scene in cases]),
     }
-
-    def plan_corner(case: tuple[Lidar, Scene], **options: Any) -> Plan:
-        try:
-            return make_plan(case[0] if survey is None else survey, case[1], **options)
-        except ValueError as error:
-            raise ValueError(f"at the bounds of the unknowns the scene is inadmissible: {error}") from error
-
+    # The first case is the start itself.
     start_lidar, start_scene = cases[0]
     start_shots = start_lidar if survey is None else survey
-    first = make_plan(start_shots, start_scene, max_orders=sizes.max_orders, **common)
+    start_options = {"max_orders": max_orders, "describe": False, **common}
+    first = make_plan(start_shots, start_scene, **start_options)
     # Fits of surveys trace all derivatives, and many shots at once.
     if survey is None and not first.config.keeps_histories:
-        first = _plan_with_histories(first, start_lidar, start_scene, max_orders=sizes.max_orders, **common)
-    width = first.bins.width
-    if any(u.setter.of_lidar for u in unknowns):
-        width = min(width, *(plan_corner(case, **common).bins.width for case in cases[1:]))
-    common.update(max_orders=first.orders, bin_width=width, histories=first.config.keeps_histories)
-    if scene.canopy is not None:
-        common.update(max_step=first.limits.max_segment)
-    if width < first.bins.width:
-        first = plan_corner(cases[0], **common)
-    return union_plan(cases, [first, *(plan_corner(case, **common) for case in cases[1:])], survey)
+        first = _plan_with_histories(first, start_lidar, start_scene, **start_options)
+    common.update(max_orders=first.orders, histories=first.config.keeps_histories)
+    try:
+        return plan_cases(cases, survey=survey, **common)
+    except ValueError as error:
+        raise ValueError(f"at the bounds of the unknowns the scene is inadmissible: {error}") from error
 
 
 def _plan_with_histories(first: Plan, lidar: Lidar, scene: Scene, **options: Any) -> Plan:
@@ -167,7 +149,7 @@ def checked_plan(
     scene: Scene,
     unknowns: list[BoundUnknown],
     time: Float[np.ndarray, " samples"],
-    sizes: TraceSizes,
+    sizes: dict[str, Any],
 ) -> Plan:
     """Check a plan for the samples and for all `corner_cases`, or make one with `plan_for_bounds`.
 
@@ -177,7 +159,7 @@ def checked_plan(
     `plan_for_bounds`.
     """
     if plan is None:
-        plan = plan_for_bounds(lidar, scene, unknowns, time, sizes)
+        plan = plan_for_bounds(lidar, scene, unknowns, time, **sizes)
         check_samples(plan, time)
         return plan
     check_samples(plan, time)
@@ -202,7 +184,7 @@ def plan_without_record(
     scene: Scene,
     unknowns: list[BoundUnknown],
     time: Float[np.ndarray, " samples"] | None,
-    sizes: TraceSizes,
+    sizes: dict[str, Any],
 ) -> Plan:
     """Check a plan for derivatives at the scene alone, or make one. `time`: None for samples of the plan.
 
@@ -211,14 +193,13 @@ def plan_without_record(
     moves_lidar = any(u.setter.of_lidar for u in unknowns)
     if plan is None and time is None:
         # Derivatives are needed at the scene only: without sample times, its own plan serves.
-        photons, rays, max_orders = sizes
-        plan = make_plan(lidar, scene, max_orders=max_orders, n_photons=photons, n_rays=rays)
+        plan = make_plan(lidar, scene, **sizes)
         if moves_lidar:
             # A plan for a beam at nadir knows no other direction, and none of its derivatives.
-            plan = plan_for_bounds(lidar, scene, unknowns, sample_times(plan), sizes)
+            plan = plan_for_bounds(lidar, scene, unknowns, sample_times(plan), **sizes)
     elif plan is None:
         assert time is not None
-        plan = plan_for_bounds(lidar, scene, unknowns, time, sizes)
+        plan = plan_for_bounds(lidar, scene, unknowns, time, **sizes)
     elif moves_lidar:
         plan = checked_plan(plan, lidar, scene, unknowns, sample_times(plan), sizes)
     else:

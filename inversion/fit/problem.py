@@ -28,7 +28,7 @@ from inversion.fit.data import (
     nothing_observed,
     with_fixed_window,
 )
-from inversion.fit.planning import checked_plan, plan_without_record, trace_sizes
+from inversion.fit.planning import checked_plan, plan_without_record, size_arguments
 from inversion.fit.recorder_model import RecorderModel, check_names
 from inversion.fit.unknowns import BoundUnknown, Setter, Unknown, bind_unknowns, with_start
 from inversion.receiver.recorder import Recorder
@@ -122,14 +122,14 @@ class Problem(eqx.Module):
       the median), 0 to 1, that replaces any smaller `noise`: a record without noise would give bins that no
       photon reached, where the simulation's standard error is zero, infinite weight. Default 1e-3.
     - `plan`: what to simulate (`jaxlidar.plan`, with the window of `observed`, valid throughout the bounds),
-      with the photons and rays of one of eight batches; one for all records. Derivatives are computed in
+      one for all records. Derivatives are computed in
       groups if all at once would take more memory than its `max_memory`. Default None: planned for the first
       lidar and scene and the corners of the bounds.
     - `n_photons`: photons of one simulation, all eight batches together, at least 8. Default None: 65536, or
       those of `plan`.
-    - `n_rays`: rays of the footprint of one simulation, all eight batches together, at least 8. Default None:
-      8192, or those of `plan`.
-    - `max_orders`: orders of scattering. Default None: chosen by the albedos of the starting scene.
+    - `n_rays`: rays that sample the footprint in each of the eight batches, at least 1. Default None: 1024,
+      or those of `plan`.
+    - `max_orders`: follow light for this many scatterings. Default None: by the albedos of the start.
 
     **Raises:** ValueError for inadmissible arguments, among them a start outside its bounds, samples that do
     not fit the lidar or the plan, a plan that does not serve all scenes within the bounds or that is given
@@ -217,7 +217,7 @@ def _bind(problem: Problem) -> BoundProblem:
     3. Read the records. What is quickly checked comes before the plan.
     4. Make the plan, or check it.
     """
-    sizes = trace_sizes(problem.n_photons, problem.n_rays, problem.max_orders, problem.plan)
+    sizes = size_arguments(problem.n_photons, problem.n_rays, problem.max_orders, problem.plan)
     records: Any = [problem.observed]
     n_records = None
     if problem.has_many_records:

@@ -20,7 +20,7 @@ from inversion.fit.implicit_differentiation import (
     estimate_derivatives,
 )
 from inversion.fit.model import Evaluation, ForwardModel, SimulationInputs
-from inversion.fit.planning import checked_plan, trace_sizes
+from inversion.fit.planning import checked_plan, size_arguments
 from inversion.fit.problem import BoundProblem, Problem, check_problem, scale_unknown
 from inversion.fit.recorder_model import RecorderModel, recorder_unknowns
 from inversion.fit.result import Retrieval, retrieval_of
@@ -213,7 +213,7 @@ def outline_of_fit(problem: Problem, key: PRNGKeyArray) -> tuple[Any, Differenti
                 "transformation, so that none can be made: make one outside and pass it as plan="
             )
         lidar = with_fixed_window(lidar)
-        sizes = trace_sizes(problem.n_photons, problem.n_rays, problem.max_orders, plan)
+        sizes = size_arguments(problem.n_photons, problem.n_rays, problem.max_orders, plan)
         plan = checked_plan(None, lidar, scene, unknowns, as_sample_times(time, lidar), sizes)
     recorder = Recorder() if problem.recorder is None else problem.recorder
     assert isinstance(recorder, Recorder)

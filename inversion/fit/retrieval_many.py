@@ -30,7 +30,7 @@ from jaxtyping import Array, PRNGKeyArray
 
 from inversion.fit.fit_summary import FitSummary
 from inversion.fit.model import Evaluation, ForwardModel, SimulationInputs, evaluate_scene
-from inversion.fit.planning import trace_sizes
+from inversion.fit.planning import size_arguments
 from inversion.fit.problem import BoundProblem, Problem, check_problem
 from inversion.fit.result import Retrieval, retrievals_of
 from inversion.fit.retrieval import solver_settings
@@ -129,7 +129,7 @@ def retrieve_many(
     lanes = check_integer("lanes", lanes)
     settings = solver_settings(max_steps, starts)
     bound = problem.bound
-    sizes = trace_sizes(problem.n_photons, problem.n_rays, problem.max_orders, problem.plan)
+    sizes = size_arguments(problem.n_photons, problem.n_rays, problem.max_orders, problem.plan)
     # Everything on which the results depend, by names that an error message shows.
     problem_parts = {
         "observed": [record.reflectance for record in bound.observed],
@@ -143,10 +143,7 @@ def retrieve_many(
         "recorder": bound.recorders,
         "key": key,
         "plan": problem.plan,
-        # A plan has its own.
-        "n_photons": sizes.photons_per_batch if problem.plan is None else None,
-        "n_rays": sizes.rays_per_batch if problem.plan is None else None,
-        "max_orders": problem.max_orders,
+        **sizes,
         "max_steps": settings.max_steps,
         "starts": settings.starts,
     }

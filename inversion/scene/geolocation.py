@@ -199,7 +199,7 @@ def geolocate(
       Default 0.
     - `ratio_error`: standard deviation of the natural logarithm of the ratio of the reflectance of plants to
       that of the ground, about the scene's, 0 or more. It is fitted unless it is 0. Default 0.5.
-    - `max_orders`: orders of scattering that are simulated, at least 1. Records of bright canopies call for
+    - `max_orders`: follow light for this many scatterings, at least 1. Records of bright canopies call for
       more than one: light scattered several times returns from below the ground, where one order has
       nothing. Default 1.
     - `rtol`: relative error of the simulation at each node, in (0, 1); that of a footprint, a sum over some

@@ -47,7 +47,7 @@ from scipy import optimize
 from scipy.sparse import linalg as sparse_linalg
 
 from inversion.fit.data import as_noise, as_sample_times, with_fixed_window
-from inversion.fit.planning import TraceSizes, plan_for_bounds
+from inversion.fit.planning import N_BATCHES, plan_for_bounds
 from inversion.fit.unknowns import (
     BoundUnknown,
     Setter,
@@ -184,9 +184,9 @@ def retrieve_scene(
     - `kernels`: by name of unknown, indices of values for which rows of the averaging kernel are computed,
       such as `{"leaf": [(5, 5, 3)]}`; each takes as long as a draw. Default None: none.
     - `plan`: a `Plan` for the survey. Default None: made here, for the bounds of the unknowns.
-    - `max_orders`: orders of scattering, at least 1. Default None: as many as the albedos ask for.
-    - `n_rays`, `n_photons`: of each shot. Default None: a ray for each column of voxels in a footprint,
-      within 32 and 512; 2048 photons.
+    - `max_orders`: follow light for this many scatterings, at least 1. Default None: as the albedos ask for.
+    - `n_rays`, `n_photons`: rays and photons of the simulation of a shot, which is one batch. Default None: a
+      ray for each column of voxels in a footprint, within 32 and 512; 2048 photons.
     - `path`: a Zarr store, whose name ends in ".zarr". A run that was interrupted goes on from its last step,
       draw or kernel. Only `progress` may change. Default None: no store.
     - `progress`: True for a bar with the latest step; or a function called with a `SceneStep` after every
@@ -240,7 +240,7 @@ def retrieve_scene(
         **sizes,
     }
     if plan is None:
-        plan = plan_for_bounds(survey, scene, bound, records.time, _trace_sizes(survey, scene, **sizes))
+        plan = plan_for_bounds(survey, scene, bound, records.time, **_plan_arguments(survey, scene, **sizes))
     elif any(value is not None for value in sizes.values()):
         raise ValueError("plan is given together with max_orders, n_rays or n_photons; admissible is either")
     # The host draws shots to hold out and signs; their numbers must not be those of the light.
@@ -395,15 +395,14 @@ def _choose_held_out(shots: int, fraction: float, random: np.random.Generator) -
     return is_held_out
 
 
-def _trace_sizes(
+def _plan_arguments(
     survey: Survey, scene: Scene, max_orders: int | None, n_rays: int | None, n_photons: int | None
-) -> TraceSizes:
-    """Return the size of the simulation of a shot, which is one batch. **Raises:** ValueError."""
-    return TraceSizes(
-        _PHOTONS if n_photons is None else check_integer("n_photons", n_photons),
-        _rays(survey, scene) if n_rays is None else check_integer("n_rays", n_rays),
-        max_orders,
-    )
+) -> dict[str, Any]:
+    """Return the arguments of `plan` for a shot, whose simulation is one batch. **Raises:** ValueError."""
+    photons = _PHOTONS if n_photons is None else check_integer("n_photons", n_photons)
+    rays = _rays(survey, scene) if n_rays is None else check_integer("n_rays", n_rays)
+    # Plans count the photons of eight batches.
+    return {"n_photons": N_BATCHES * photons, "n_rays": rays, "max_orders": max_orders}
 
 
 def _rays(survey: Survey, scene: Scene) -> int:

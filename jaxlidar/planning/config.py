@@ -119,7 +119,7 @@ class TraceConfig:
       all orders and for order one.
     - `keeps_histories`: True if the response keeps scattering histories; otherwise optics are applied while
       light is traced.
-    - `n_rays`, `n_photons`: rays and photons of a batch.
+    - `n_rays`, `photons_per_batch`: rays and photons of a batch.
 
     The footprint:
 
@@ -146,7 +146,7 @@ class TraceConfig:
     first_degree: int
     keeps_histories: bool
     n_rays: int
-    n_photons: int
+    photons_per_batch: int
     uses_quadrature: bool
     random_footprint: bool
     n_mesh_materials: int = 0
@@ -159,7 +159,7 @@ class TraceConfig:
     @property
     def photons_traced(self) -> int:
         """Photons that a batch traces: none where only one order is followed."""
-        return self.n_photons if self.follows_higher_orders else 0
+        return self.photons_per_batch if self.follows_higher_orders else 0
 
     @property
     def is_random(self) -> bool:

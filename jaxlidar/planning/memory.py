@@ -163,7 +163,7 @@ def _number_bytes() -> int:
 
 def _photons_and_segments(config: TraceConfig) -> int:
     """Photons and ray segments that are alive at once."""
-    return config.n_photons + min(config.n_rays, _RAYS_AT_ONCE) * config.max_ray_segments
+    return config.photons_per_batch + min(config.n_rays, _RAYS_AT_ONCE) * config.max_ray_segments
 
 
 def memory_limit(max_memory: float | None) -> float:

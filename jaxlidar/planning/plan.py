@@ -190,13 +190,13 @@ class Plan(eqx.Module):
 
     @property
     def n_rays(self) -> int:
-        """Rays of the footprint in a batch; they carry the first order."""
+        """Rays that sample the footprint in each batch; they carry the first order."""
         return self.config.n_rays
 
     @property
     def n_photons(self) -> int:
-        """Photons in a batch; they carry the higher orders."""
-        return self.config.n_photons
+        """Photons of eight batches together; they carry the higher orders."""
+        return MIN_BATCHES * self.config.photons_per_batch
 
     @property
     def photons_traced(self) -> int:
@@ -248,7 +248,7 @@ class Plan(eqx.Module):
         if not self.config.uses_quadrature and self.n_rays > 1:
             sizes += f", {self.n_rays} rays"
         if self.config.follows_higher_orders:
-            sizes += f", {self.n_photons} photons a batch, {self.orders} orders"
+            sizes += f", {self.config.photons_per_batch} photons a batch, {self.orders} orders"
         if not self.config.keeps_histories:
             sizes += ", optics applied while light is traced"
         # Memory is linear in the number of columns: two of them give the intercept and the slope.
@@ -265,7 +265,7 @@ def plan(
     rtol: float | None = None,
     max_orders: int | None = None,
     max_step: float | None = None,
-    n_photons: int = 8192,
+    n_photons: int = 65536,
     n_rays: int | None = None,
     window: tuple[float, float] | None = None,
     bin_width: float | None = None,
@@ -288,14 +288,15 @@ def plan(
     - `scene`: a `Scene`.
     - `rtol`: relative accuracy aimed at, in (0, 1); sets how many orders are worth following, and for how
       long. Default None: 0.01.
-    - `max_orders`: follow exactly this many scatterings, whatever `rtol` needs; at least 1. Default None:
+    - `max_orders`: follow light for this many scatterings, whatever `rtol` needs; at least 1. Default None:
       from `rtol` and the optics; with histories, as many as their table has room for (some 16 to 29).
     - `max_step`: longest segment, m, of a footprint ray that order one deposits at once; positive. The result
       does not depend on it. Default None: the ray's chord in a voxel, or about 64 fine bins.
-    - `n_photons`: photons per batch, at least 1. Default 8192.
-    - `n_rays`: rays of the footprint per batch, at least 1; without effect over planes alone, where a
-      quadrature rule takes their place. Default None: 4096 with one order or a fixed footprint; else 2048
-      where the pulse's standard deviation, with its jitter, is below a sampling interval; else 1024.
+    - `n_photons`: photons of eight batches together, at least 1, rounded up to as many for each. Simulations
+      trace eight batches, or more until their error is reached. Default 65536.
+    - `n_rays`: rays that sample the footprint in each batch, at least 1; without effect over planes alone,
+      where a quadrature rule takes their place. Default None: 4096 with one order or a fixed footprint; else
+      2048 where the pulse's standard deviation, with its jitter, is below a sampling interval; else 1024.
     - `window`: (first, last) sample time, ns. Default None: covers the scene, and multiple scattering until
       what returns later is likely to be below `rtol`, for 3000 ns at most; for 300 ns at most where
       thousands of histories must be kept (many orders and more than 8 wavelengths).
@@ -451,7 +452,7 @@ def plan(
         # A beam whose divergence is switched off is one ray. One whose divergence is zero is not, as the plan
         # also serves wider beams.
         n_rays=int(n_rays) if wide_beam else 1,
-        n_photons=int(n_photons),
+        photons_per_batch=-(-int(n_photons) // MIN_BATCHES),
         uses_quadrature=consists_of_planes(scene) and wide_beam,
         random_footprint=footprint == "random" and wide_beam,
     )

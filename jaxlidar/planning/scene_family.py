@@ -26,9 +26,7 @@ from jaxlidar.sensors.lidar import Lidar
 from jaxlidar.sensors.survey import Survey
 
 
-def union_plan(
-    cases: Sequence[tuple[Lidar, Scene]], plans: Sequence[Plan], survey: Survey | None = None
-) -> Plan:
+def _union_plan(cases: Sequence[tuple[Lidar, Scene]], plans: Sequence[Plan], survey: Survey | None) -> Plan:
     """Return the first plan with fine time bins and loops that are long enough for the cases of all plans.
 
     The plans share the width of their bins, the number of orders and the samples. Scatterer channels are
@@ -100,7 +98,7 @@ def plan_scenes(
       have a leading axis of scenes: of these, the scenes with extreme values are examined, and two that
       combine the smallest and the largest values of heights, sizes, slopes and extinctions.
     - `window`: (first, last) sample time, ns. Default None: covers what `plan` chooses for each scene.
-    - `max_orders`: orders of scattering. Default None: as many as any of the scenes calls for.
+    - `max_orders`: follow light for this many scatterings. Default None: as many as any of the scenes needs.
     - `effects`, `options`: further arguments of `plan`. Its `histories` are False by default where a scene
       then takes less memory, as there is a response for each scene.
 
@@ -130,7 +128,10 @@ def plan_scenes(
         *cases[0], window=window, effects=effects, **options
     ):
         options["histories"] = False
-    return plan_cases(cases, window=window, effects=effects, **options)
+    try:
+        return plan_cases(cases, window=window, effects=effects, **options)
+    except ValueError as error:
+        raise ValueError(f"a scene at the extremes of the family is inadmissible: {error}") from error
 
 
 def _applied_optics_take_less(lidar: Lidar, scene: Scene, **options: Any) -> bool:
@@ -149,11 +150,13 @@ def plan_cases(
     window: tuple[float, float] | None,
     max_orders: int | None,
     effects: Mapping[str, bool],
+    survey: Survey | None = None,
     **options: Any,
 ) -> Plan:
     """Make one plan that serves pairs of a lidar and a scene, each as it is.
 
-    Lidars have one sampling interval; other arguments are those of `plan_scenes`.
+    Lidars have one sampling interval; other arguments are those of `plan_scenes`. With a `survey` the plan
+    serves all of its shots over each scene.
 
     **Raises:** ValueError for scenes of different structure.
 
@@ -163,41 +166,58 @@ def plan_cases(
     """
     _check_one_structure([scene for _, scene in cases])
     common: dict[str, Any] = {**options, "effects": effects, "describe": False}
-    trials = [_plan_of(*case, {**common, "window": window, "max_orders": max_orders}) for case in cases]
+
+    def plan_case(lidar: Lidar, scene: Scene, settings: Mapping[str, Any]) -> Plan:
+        return plan(lidar if survey is None else survey, scene, **settings)
+
+    trials = [plan_case(*case, {**common, "window": window, "max_orders": max_orders}) for case in cases]
     # A channel of a transmittance that is zero is harmless; one that is missing is not.
     first = max(range(len(trials)), key=lambda i: len(trials[i].config.channels))
+    order = [first, *(i for i in range(len(trials)) if i != first)]
+    cases, trials = [cases[i] for i in order], [trials[i] for i in order]
+    settings = [_common_settings(p, window) for p in trials]
     if window is None:
-        starts = [p.sample_start for p in trials]
-        ends = [p.sample_start + p.sample_interval * (p.n_samples - 1) for p in trials]
-        # A thousandth of a sample keeps the last one in a window whose end is rounded.
-        window = (min(starts), max(ends) + 1e-3 * trials[first].sample_interval)
+        starts, ends = zip(*(s["window"] for s in settings))
+        window = (min(starts), max(ends))
     common |= {
         "window": window,
-        "max_orders": max(p.orders for p in trials),
-        "histories": all(p.config.keeps_histories for p in trials),
-        "bin_width": min(p.bins.width for p in trials),
+        "max_orders": max(s["max_orders"] for s in settings),
+        "histories": all(s["histories"] for s in settings),
+        "bin_width": min(s["bin_width"] for s in settings),
     }
-    if cases[first][1].canopy is not None:
-        common["max_step"] = max(p.limits.max_segment for p in trials)
-    order = [first, *(i for i in range(len(trials)) if i != first)]
-    plans = [_plan_of(*cases[i], common) for i in order]
-    united = union_plan([cases[i] for i in order], plans)
+    steps = [s["max_step"] for s in settings if "max_step" in s]
+    if steps:
+        common["max_step"] = max(steps)
+    # What was planned with the common settings already serves as it is.
+    plans = [
+        trial if own.items() <= common.items() else plan_case(*case, common)
+        for case, trial, own in zip(cases, trials, settings)
+    ]
+    united = _union_plan(cases, plans, survey)
     scope = dataclasses.replace(
         united.scope,
         first_return=min(p.scope.first_return for p in trials),
         last_return=max(p.scope.last_return for p in trials),
         albedo=max(p.scope.albedo for p in trials),
-        automatic_orders=max_orders is None and trials[first].scope.automatic_orders,
-        automatic_window=trials[first].scope.automatic_window,
+        automatic_orders=max_orders is None and trials[0].scope.automatic_orders,
+        automatic_window=trials[0].scope.automatic_window,
     )
     return dataclasses.replace(united, scope=scope)
 
 
-def _plan_of(lidar: Lidar, scene: Scene, options: dict[str, Any]) -> Plan:
-    try:
-        return plan(lidar, scene, **options)
-    except ValueError as error:
-        raise ValueError(f"a scene at the extremes of the family is inadmissible: {error}") from error
+def _common_settings(trial: Plan, window: tuple[float, float] | None) -> dict[str, Any]:
+    """Return what the plans of a family have in common, as arguments that `plan` made of its own."""
+    # A thousandth of a sample keeps the last one in a window whose end is rounded.
+    end = trial.sample_start + (trial.n_samples - 1 + 1e-3) * trial.sample_interval
+    settings = {
+        "window": (trial.sample_start, end) if window is None else window,
+        "max_orders": trial.orders,
+        "histories": trial.config.keeps_histories,
+        "bin_width": trial.bins.width,
+    }
+    if trial.config.leaf is not None or trial.config.bark is not None:
+        settings["max_step"] = trial.limits.max_segment
+    return settings
 
 
 def check_scenes(scenes: Any, expected: str) -> list[Scene]:

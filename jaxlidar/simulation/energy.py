@@ -105,7 +105,8 @@ def energy_budget(
       energy, in (0, 1). Default 0.002.
     - `illumination`: "beam" (default), or "parallel": light from the beam's direction over one period of a
       canopy with periodic sides.
-    - `max_orders`: scatterings followed, at least 1; light that remains then is `unfollowed`. Default 10,000.
+    - `max_orders`: follow light for this many scatterings, at least 1; what remains then is `unfollowed`.
+      Default 10,000.
     - `max_photons`: stop after this number of photons, at least 1, whatever the error. Default 100,000,000.
     - `progress`: True for a bar with the error and the time left; or a function called with a `Progress`
       after every round. Default None: silent.

@@ -225,7 +225,7 @@ def _check_or_make_plan(
     batch_photons = -(-goal.n_photons // MIN_BATCHES)
     if not is_transformed:
         batch_photons = min(batch_photons, MAX_BATCH_PHOTONS)
-    return plan.with_config(n_photons=batch_photons)
+    return plan.with_config(photons_per_batch=batch_photons)
 
 
 def _more_orders(
@@ -442,7 +442,7 @@ def _trace_batches(
         stop = StoppingRule(rtol, goal.atol, MIN_BATCHES)
     else:
         # Rounded up: at least as many photons as were asked for.
-        max_batches = max(MIN_BATCHES, -(-goal.n_photons // plan.n_photons))
+        max_batches = max(MIN_BATCHES, -(-goal.n_photons // plan.config.photons_per_batch))
         stop = StoppingRule(rtol=None, min_size=MIN_BATCHES, max_size=max_batches)
     trace_batch = tracer.batch_function(key)
     with side_by_side() as run:

@@ -142,7 +142,8 @@ def reflectance_factor(
     - `wavelengths`: nm, one number or several that increase strictly.
     - `key`: a JAX random key.
     - `n_photons`: photons of all eight batches together, at least 8. Default None: 131072.
-    - `max_orders`: orders of scattering. Default None: as many as the albedos call for, to 0.1 %.
+    - `max_orders`: follow light for this many scatterings. Default None: as many as the albedos call for, to
+      0.1 %.
     - `area`: (2, 2) the corners (x, y) of the area in view, m, on the plane z = 0. Default None: the extent
       of the voxel map, or else of the terrain.
     - `plan`: a `Plan` of `plan_reflectance`. Cannot be combined with `n_photons` and `max_orders`. Default
@@ -389,7 +390,7 @@ def _make_plan(
         scene,
         rtol=_RTOL,
         max_orders=max_orders,
-        n_photons=-(-n_photons // MIN_BATCHES),
+        n_photons=n_photons,
         window=(half_time - 100.0, half_time - 99.0),
         bin_width=0.25 * _LONGEST_PATH_TIME,
         describe=False,

@@ -72,9 +72,9 @@ def choose_strategy(
     rtol = DEFAULT_RTOL if rtol is None else float(rtol)
     # Eight batches then have 6.4 / rtol^2 photons, before these are rounded and bounded: a sample with a
     # sixth of the light has the relative error rtol.
-    n_photons = _power_of_two(0.8 / rtol**2, *_PHOTONS)
+    photons = _power_of_two(0.8 / rtol**2, *_PHOTONS)
     columns = _columns_of_footprint(plan, survey, scene)
-    plan = plan.with_config(n_rays=_rays_of_batch(plan, columns, rtol), n_photons=n_photons)
+    plan = plan.with_config(n_rays=_rays_of_batch(plan, columns, rtol), photons_per_batch=photons)
     # The setup is that of one shot in the middle of the survey, with the largest zenith angle.
     middle = survey.middle
     setup = make_setup(middle, scene, plan)
@@ -208,7 +208,7 @@ def _groups(
     # The sum of the coefficients of a mean footprint, over the largest one. A node with `light` one gets the
     # photons of a batch divided by this sum, so that all nodes of a footprint together have at least a batch.
     light_per_footprint = float(nodes.light.sum()) * nodes.overlap / len(splines.first_node)
-    photons = plan.n_photons / photons_divisor / light_per_footprint if plan.orders > 1 else 0.0
+    photons = plan.photons_traced / photons_divisor / light_per_footprint
     return make_groups(splines, nodes, photons, plan.n_rays / _RAYS_DIVISOR / light_per_footprint)
 
 

@@ -96,7 +96,7 @@ def simulate_many(
     - `rtol`: relative error to reach for every shot, in (0, 1). Default None: 0.01. In narrow shots
       at first order, what covers less than a tenth of `rtol` of a footprint may be met by no ray, and is then
       not in the standard error.
-    - `max_orders`: follow exactly this many scatterings, whatever `rtol` needs; at least 1. Default None:
+    - `max_orders`: follow light for this many scatterings, whatever `rtol` needs; at least 1. Default None:
       from `rtol` and the optics.
     - `path`: a Zarr store, whose name ends in ".zarr", for the waveforms as they come, with their case, so
       that `jaxlidar.rerun` can simulate them again. The same call goes on with what is there, also after it

@@ -90,9 +90,9 @@ class Response(eqx.Module):
 def trace_scene(setup: Setup, key: PRNGKeyArray, *, reverse: bool = True) -> Response:
     """Trace the response of one batch: the deterministic first order, and photons for the higher ones.
 
-    A batch has `plan.n_photons` photons. The function is pure, to be compiled, batched and differentiated.
-    Wavelengths enter only where leaves transmit straight on, and where optics are applied while light is
-    traced, because histories would be too many.
+    The function is pure, to be compiled, batched and differentiated. Wavelengths enter only where leaves
+    transmit straight on, and where optics are applied while light is traced, because histories would be too
+    many.
 
     **Arguments:**
 

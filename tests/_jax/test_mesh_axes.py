@@ -29,7 +29,7 @@ def scene_of(lad, hotspot=False):
 
 # Within a program the scene is made of traced arrays, also the heights of terrain that is a plane.
 EFFECTS = {"relief": True} if isinstance(scene_of(LADS[0]).ground, jl.Terrain) else None
-PLAN = jl.plan(LIDAR, scene_of(LADS[0]), n_photons=64, n_rays=64, max_orders=ORDERS, effects=EFFECTS)
+PLAN = jl.plan(LIDAR, scene_of(LADS[0]), n_photons=512, n_rays=64, max_orders=ORDERS, effects=EFFECTS)
 
 
 def simulated(lad, key=KEY):

@@ -65,7 +65,7 @@ def test_a_scene_can_be_traced_for_forward_derivatives_alone():
     )
     canopy = jl.Canopy(voxels, leaf=jl.LeafOptics(0.4, 0.4), hotspot=False)
     scene = jl.Scene(canopy=canopy, ground=jl.Ground(reflectance=0.3))
-    setup = jl.make_setup(lidar, scene, jl.plan(lidar, scene, max_orders=3, n_photons=256))
+    setup = jl.make_setup(lidar, scene, jl.plan(lidar, scene, max_orders=3, n_photons=2048))
     totals = []
     for reverse in (True, False):
         response = jax.jit(lambda key, r=reverse: jl.trace_scene(setup, key, reverse=r))(KEY)

@@ -321,7 +321,7 @@ def test_interrupts_and_failures_to_write_leave_no_traceback(monkeypatch, capsys
 @pytest.mark.slow
 def test_demo_retrieves_the_truth_and_writes_figures(monkeypatch, tmp_path, capsys):
     monkeypatch.setattr(inversion.demo, "FIT_PHOTONS", 4096)
-    monkeypatch.setattr(inversion.demo, "FIT_RAYS", 1024)
+    monkeypatch.setattr(inversion.demo, "FIT_RAYS", 128)
     out = tmp_path / "new" / "folder"
     assert cli.main(["demo", "--out", str(out), "--voxel-size", "1", "--rtol", "0.03", "--quiet"]) == 0
     output, errors = capsys.readouterr()

@@ -198,7 +198,9 @@ def test_the_energy_budget_of_all_orders_adds_up():
 
 def derivative_error(law, name, step):
     """Difference of derivatives by JAX and by central differences, means of batches; its standard error."""
-    plan = jl.plan(LIDAR, below_plate(START, law), max_orders=4, n_photons=65536, n_rays=512, **SINGLE_SAMPLE)
+    plan = jl.plan(
+        LIDAR, below_plate(START, law), max_orders=4, n_photons=524288, n_rays=512, **SINGLE_SAMPLE
+    )
 
     def measure(value, key):
         setup = jl.make_setup(LIDAR, below_plate(START | {name: value}, law), plan)
@@ -265,7 +267,7 @@ def test_scattering_between_surfaces_follows_the_law():
     """
     plate = jl.Plate(height=4.0, reflectance=0.0, transmittance=1.0, transmission="diffuse")
     scene = jl.Scene(plates=(plate,), ground=jl.Ground(reflectance=0.5, law=Minnaert(k=2.0)))
-    plan = jl.plan(LIDAR, scene, max_orders=3, n_photons=16384, n_rays=64, **SINGLE_SAMPLE)
+    plan = jl.plan(LIDAR, scene, max_orders=3, n_photons=131072, n_rays=64, **SINGLE_SAMPLE)
     mean, stderr = batch_mean(LIDAR, scene, plan, seed=2, count=16, quantity=total_return)
     assert agrees(mean, stderr, 0.5 * 2 / 3, bound=1e-3, sigmas=4.0)
     assert not agrees(mean, stderr, 0.5, bound=1e-3, sigmas=4.0)

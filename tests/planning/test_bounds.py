@@ -17,7 +17,7 @@ HAZE = jl.Atmosphere(visibility=10.0, lidar_ratio=30.0)
 
 
 def planned(lidar, scene, **settings):
-    return jl.plan(lidar, scene, **({"n_photons": 512, "n_rays": 256, "window": (-100.0, 50.0)} | settings))
+    return jl.plan(lidar, scene, **({"n_photons": 4096, "n_rays": 256, "window": (-100.0, 50.0)} | settings))
 
 
 def effect(plan, name):

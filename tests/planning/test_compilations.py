@@ -105,7 +105,7 @@ def test_rounding_up_of_sizes_changes_no_value():
     wave = jl.simulate(lidar, scene, **settings)
     # Within a transformation sizes are those of the plan.
     setup = jl.make_setup(
-        lidar, scene, jl.plan(lidar, scene, max_orders=5, window=(-60.0, 30.0), n_photons=2500)
+        lidar, scene, jl.plan(lidar, scene, max_orders=5, window=(-60.0, 30.0), n_photons=20000)
     )
     assert setup.plan.config.order_steps == 6
     total = jax.jit(lambda key: jl.total_reflectance(jl.trace_scene(setup, key), setup))

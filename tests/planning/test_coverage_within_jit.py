@@ -129,7 +129,7 @@ def test_rounding_does_not_uncover_the_scene_of_the_plan(make, altitude, beam):
 
 
 def test_lost_tells_in_a_batch_and_derivatives_stay_finite():
-    plan = jl.plan(LIDAR, PLATES, max_orders=2, n_photons=64, describe=False)
+    plan = jl.plan(LIDAR, PLATES, max_orders=2, n_photons=512, describe=False)
 
     def wave(height):
         scene = eqx.tree_at(lambda s: s.plates[0].height, PLATES, height)

@@ -16,7 +16,7 @@ import pytest
 import inversion
 import jaxlidar as jl
 from inversion.fit.model import ForwardModel, tangents_per_pass
-from inversion.fit.planning import plan_for_bounds, trace_sizes
+from inversion.fit.planning import plan_for_bounds, size_arguments
 from inversion.fit.unknowns import bind_unknowns
 from jaxlidar.planning import memory
 from jaxlidar.planning.memory import check_memory, format_bytes, memory_limit
@@ -50,7 +50,7 @@ def test_the_sum_of_photons_is_the_result():
     """Beside the result there is one tally, that of a group of photons, with margins."""
     canopy = jl.Canopy(slab(1.0), leaf=jl.LeafOptics(0.4, 0.4), hotspot=False)
     scene, lidar = jl.Scene(canopy=canopy, plates=plates(1), ground=GROUND), jl.Lidar()
-    plan = jl.plan(lidar, scene, n_photons=16384, max_orders=8, histories=True, describe=False)
+    plan = jl.plan(lidar, scene, n_photons=131072, max_orders=8, histories=True, describe=False)
     device_scene = build_device_scene(jl.make_setup(lidar, scene, plan), derivatives="none")
     compiled = jax.jit(lambda key: trace_higher_orders(device_scene, key)).lower(KEY).compile()
     sizes = compiled.memory_analysis()
@@ -64,7 +64,7 @@ def test_the_waveform_of_a_sum_needs_no_second_response():
     """The mean over batches is taken after the sum over histories: a mean response would be as large."""
     canopy = jl.Canopy(slab(1.0), leaf=jl.LeafOptics(0.4, 0.4), bark=0.4, hotspot=False)
     scene, lidar = jl.Scene(canopy=canopy, plates=plates(1), ground=GROUND), jl.Lidar()
-    plan = jl.plan(lidar, scene, n_photons=16384, max_orders=8, histories=True, describe=False)
+    plan = jl.plan(lidar, scene, n_photons=131072, max_orders=8, histories=True, describe=False)
     tracer = make_batch_tracer(jl.make_setup(lidar, scene, plan), KEY)
     response, _ = tracer.batch_function(KEY)(0)
     size = sum(array.nbytes for array in jax.tree.leaves(response))
@@ -137,7 +137,7 @@ def test_derivatives_where_optics_are_applied_while_light_is_traced():
 
     scene = jl.Scene(canopy=jl.Canopy(slab(0.5), leaf=LEAF, hotspot=False), ground=GROUND)
     plan = jl.plan(
-        TWO_WAVELENGTHS, scene, max_orders=4, n_photons=2048, window=(-100.0, 60.0), describe=False
+        TWO_WAVELENGTHS, scene, max_orders=4, n_photons=16384, window=(-100.0, 60.0), describe=False
     )
     x = jax.numpy.array([0.3, 0.1])
     a, b = (jax.jit(jax.jacfwd(lambda x, p=p: total(p, x)))(x) for p in (plan, with_applied_optics(plan)))
@@ -293,7 +293,7 @@ def layered(orders, layers=4, end=100.0, max_memory=None, **settings):
     """Return a model with leaf by layer and height and reflectance of the ground unknown, and its start."""
     voxels = slab(0.4, 0.05, shape=(1, 1, layers))
     scene = jl.Scene(canopy=jl.Canopy(voxels, leaf=LEAF, bark=0.3, hotspot=False), ground=GROUND)
-    settings = {"n_photons": 256, "n_rays": 64, **settings}
+    settings = {"n_photons": 2048, "n_rays": 64, **settings}
     plan = jl.plan(TWO_WAVELENGTHS, scene, max_orders=orders, window=(-81.0, end), describe=False, **settings)
     plan = dataclasses.replace(plan, scope=dataclasses.replace(plan.scope, max_memory=max_memory))
     layer_factors = {"bounds": (0.5, 2.0), "start": np.ones(layers), "apply": layers_scaled, "name": "layers"}
@@ -339,7 +339,7 @@ def test_columns_of_a_jacobian_are_computed_in_groups_if_memory_is_short():
 def test_derivatives_have_no_histories_beyond_the_last_order():
     """Programs without derivatives have room for more histories, to be shared by plans."""
     scene = jl.Scene(canopy=jl.Canopy(slab(0.4), leaf=LEAF, hotspot=False), ground=GROUND)
-    settings = {"n_photons": 16, "window": (-81.0, 50.0), "describe": False}
+    settings = {"n_photons": 128, "window": (-81.0, 50.0), "describe": False}
     plan = jl.plan(TWO_WAVELENGTHS, scene, max_orders=9, **settings)
     n_channels = len(plan.config.channels)
     assert 9 == plan.degree < plan.config.degree
@@ -407,7 +407,7 @@ EVALUATE_MODEL = """
 from tests.planning.test_memory import layered, room_for
 
 orders, layers, end = int(sys.argv[1]), int(sys.argv[2]), float(sys.argv[3])
-model, start = layered(orders, layers, end, max_memory=15.0, n_photons=2048, histories=True)
+model, start = layered(orders, layers, end, max_memory=15.0, n_photons=16384, histories=True)
 model(start)
 assert model.inputs.tangents_per_pass == layers + 1
 print(1e9 * room_for(model, layers + 1), watched(lambda: model(start)))
@@ -449,6 +449,6 @@ def test_large_histories_are_left_to_fits(orders, keeps):
     assert plan.config.keeps_histories is keeps
     unknown = inversion.Unknown("ground.reflectance", bounds=(0.1, 0.9))
     time = np.arange(-80.0, 40.0)
-    sizes = trace_sizes(None, None, orders, None)
-    fitted = plan_for_bounds(jl.Lidar(), scene, bind_unknowns([unknown], scene), time, sizes)
+    sizes = size_arguments(None, None, orders, None)
+    fitted = plan_for_bounds(jl.Lidar(), scene, bind_unknowns([unknown], scene), time, **sizes)
     assert fitted.config.keeps_histories

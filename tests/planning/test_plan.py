@@ -18,7 +18,7 @@ LEAF = jl.LeafOptics(reflectance=0.1, transmittance=0.05)
 LEAVES = jl.Canopy(slab(0.8), leaf=LEAF, hotspot=False)
 TREES = jl.Canopy(slab(0.8, 0.1), leaf=LEAF, bark=0.3, hotspot=False)
 HAZE = jl.Atmosphere(visibility=10.0, lidar_ratio=30.0)
-SIZES = {"n_photons": 512, "n_rays": 256, "window": (-100.0, 50.0)}
+SIZES = {"n_photons": 4096, "n_rays": 256, "window": (-100.0, 50.0)}
 LOOPS = ("scan[", "while[", "cond[")
 RANDOM = ("random_", "threefry")
 
@@ -268,7 +268,7 @@ def test_a_scene_far_from_every_beam_is_of_another_map(kind):
 
 PLANS_AS_ARGUMENTS = {
     "simulate": (
-        lambda scene: jl.plan(LIDAR_OF_PLANS, scene, max_orders=2, n_photons=256, describe=False),
+        lambda scene: jl.plan(LIDAR_OF_PLANS, scene, max_orders=2, n_photons=2048, describe=False),
         lambda scene, plan: jl.simulate(LIDAR_OF_PLANS, scene, key=KEY_OF_PLANS, plan=plan).reflectance,
     ),
     "truth_of": (

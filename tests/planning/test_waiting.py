@@ -142,14 +142,14 @@ def simulate_scenes(case):
 
 
 def plan_scenes(case, scenes):
-    return jl.plan_scenes(case.lidar, scenes, max_orders=2, n_photons=256, window=case.window)
+    return jl.plan_scenes(case.lidar, scenes, max_orders=2, n_photons=2048, window=case.window)
 
 
 def retrieve(case):
     wave = simulate(case)
     unknowns = [inversion.Unknown("canopy.leaf.Cab", bounds=(5.0, case.Cab + 40.0), name="Cab")]
     problem = inversion.Problem(
-        wave, case.lidar, case.scene, unknowns, noise=0.01, n_photons=512, n_rays=256, max_orders=2
+        wave, case.lidar, case.scene, unknowns, noise=0.01, n_photons=512, n_rays=32, max_orders=2
     )
     return inversion.retrieve(problem, key=KEY, max_steps=2)
 

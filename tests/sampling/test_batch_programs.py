@@ -41,7 +41,7 @@ def same(plan):
 )
 def test_a_batch_is_the_trace_of_its_key(orders, transmission, change):
     crown = scene(transmission=transmission)
-    plan = jl.plan(LIDAR, crown, max_orders=orders, n_photons=256, n_rays=64, window=(-50.0, 20.0))
+    plan = jl.plan(LIDAR, crown, max_orders=orders, n_photons=2048, n_rays=64, window=(-50.0, 20.0))
     tracer = batch_programs.make_batch_tracer(jl.make_setup(LIDAR, crown, change(plan)), KEY)
     batch, trace = tracer.batch_function(KEY), eqx.filter_jit(trace_device_scene)
     response, estimate = batch(3)
@@ -76,7 +76,7 @@ def test_traces_begin_to_compile_before_the_waveform_model_is_made(monkeypatch):
     monkeypatch.setattr(batch_programs, "make_padded_waveform_model", make_model)
     crown = scene()
     # A scene that has not been simulated before: its device scene, too, has yet to be compiled.
-    plan = jl.plan(LIDAR, crown, max_orders=3, n_photons=96, n_rays=64, window=(-50.0, 20.0))
+    plan = jl.plan(LIDAR, crown, max_orders=3, n_photons=768, n_rays=64, window=(-50.0, 20.0))
     batch_programs.make_batch_tracer(jl.make_setup(LIDAR, crown, plan), KEY)
     (compilation,) = compilations
     assert compilation is not None

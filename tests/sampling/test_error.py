@@ -38,7 +38,7 @@ CASES = {
 @pytest.mark.parametrize("case", CASES)
 def test_the_truth_lies_within_two_reported_errors(case):
     scene, rtol = CASES[case]
-    plan = jl.plan(LIDAR, scene, max_orders=4, n_photons=1024, n_rays=256, window=(-80.0, 60.0))
+    plan = jl.plan(LIDAR, scene, max_orders=4, n_photons=8192, n_rays=256, window=(-80.0, 60.0))
     reference = jl.simulate(LIDAR, scene, key=jax.random.key(10**6), plan=plan, rtol=rtol / 10)
     truth = np.asarray(reference.reflectance, float)
     bright = truth > 0.01 * truth.max()

@@ -22,7 +22,7 @@ def batch_photons(monkeypatch):
     photons, make_batch_tracer = [], simulation.make_batch_tracer
 
     def recording(setup, key):
-        photons.append(setup.plan.n_photons)
+        photons.append(setup.plan.config.photons_per_batch)
         return make_batch_tracer(setup, key)
 
     monkeypatch.setattr(simulation, "make_batch_tracer", recording)

@@ -234,7 +234,7 @@ def test_a_raster_of_equal_numbers_is_one_number():
     lidar = single_sample_lidar(divergence=0.005)
     number, raster = (jl.Scene(ground=hills(reflectance=rho)) for rho in (0.4, np.full_like(HILLS, 0.4)))
     plans = [
-        jl.plan(lidar, scene, max_orders=3, n_photons=1024, **SINGLE_SAMPLE) for scene in (number, raster)
+        jl.plan(lidar, scene, max_orders=3, n_photons=8192, **SINGLE_SAMPLE) for scene in (number, raster)
     ]
     of_number, of_raster = (
         batch_mean(lidar, scene, plan, seed=0, count=2, quantity=energies)[0]
@@ -278,7 +278,7 @@ def test_derivatives_with_respect_to_heights(zenith, orders, photons, keys, heig
         reflectance = jnp.asarray(0.4 + 0.0 * X) + p["strip"] * jnp.asarray(X > 9.5)
         return jl.Scene(ground=hills(heights=relief, reflectance=reflectance))
 
-    size = {"n_photons": photons, "n_rays": 2048}
+    size = {"n_photons": 8 * photons, "n_rays": 2048}
     plan = jl.plan(lidar, build(start), max_orders=orders, window=(-60.0, 60.0), **size)
 
     def measure(p, key):
@@ -308,7 +308,7 @@ def test_derivatives_with_respect_to_heights(zenith, orders, photons, keys, heig
 @pytest.mark.slow
 def test_the_gradient_is_that_of_the_jacobian():
     scene = jl.Scene(ground=hills())
-    plan = jl.plan(jl.Lidar(divergence=2.0), scene, max_orders=2, n_photons=256, n_rays=64)
+    plan = jl.plan(jl.Lidar(divergence=2.0), scene, max_orders=2, n_photons=2048, n_rays=64)
 
     def brightness(heights):
         setup = jl.make_setup(
@@ -377,7 +377,7 @@ def test_a_ridge_hides_its_far_slope():
     ridge = np.maximum(0.0, 6.0 - np.abs(X - 10.0))
     scene = jl.Scene(ground=hills(heights=ridge, reflectance=0.9))
     lidar = single_sample_lidar(zenith=60.0, azimuth=90.0, altitude=1e3, position=(5.0, 0.0), divergence=0.5)
-    plan = jl.plan(lidar, scene, max_orders=2, n_photons=2048, n_rays=64, **SINGLE_SAMPLE)
+    plan = jl.plan(lidar, scene, max_orders=2, n_photons=16384, n_rays=64, **SINGLE_SAMPLE)
     setup = jl.make_setup(lidar, scene, plan)
     from jaxlidar.trace.device_scene import build_device_scene
 

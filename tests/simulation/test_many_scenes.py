@@ -36,7 +36,7 @@ def scene_number(scenes, i):
 
 @pytest.fixture(scope="module")
 def plan_of_two_orders():
-    return jl.plan_scenes(LIDAR, random_stands(), max_orders=2, n_photons=64, n_rays=8)
+    return jl.plan_scenes(LIDAR, random_stands(), max_orders=2, n_photons=512, n_rays=8)
 
 
 @pytest.fixture(scope="module")
@@ -71,7 +71,7 @@ def test_standard_errors_are_those_of_each_scene(waves, plan_of_two_orders):
 
 @pytest.mark.parametrize("orders", slow_unless([1], [1, 2]))
 def test_chunks_and_other_scenes_change_nothing(orders):
-    plan = jl.plan_scenes(LIDAR, random_stands(), max_orders=orders, n_photons=64, n_rays=8)
+    plan = jl.plan_scenes(LIDAR, random_stands(), max_orders=orders, n_photons=512, n_rays=8)
     fewer = jax.tree.map(lambda a: a[:5], random_stands())
     waves, repeated = (
         jl.simulate_scenes(LIDAR, scenes, plan=plan, key=KEY, chunk=3) for scenes in (random_stands(), fewer)

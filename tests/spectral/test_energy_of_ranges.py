@@ -68,7 +68,7 @@ def test_the_pulse_changes_no_energy():
     voxels = jl.VoxelMap.from_lad(np.full((1, 1, 4), 0.4), voxel_size=2.0)
     canopy = jl.Canopy(voxels, leaf=jl.LeafOptics(reflectance=0.5, transmittance=0.4), sides="periodic")
     scene = jl.Scene(canopy=canopy, ground=jl.Ground(reflectance=0.4))
-    plan = jl.plan(near_lidar(), scene, max_orders=2, window=(-130.0, 150.0), n_photons=1024, n_rays=256)
+    plan = jl.plan(near_lidar(), scene, max_orders=2, window=(-130.0, 150.0), n_photons=8192, n_rays=256)
     setups = [jl.make_setup(near_lidar(pulse=pulse), scene, plan) for pulse in (LONG, SHORT)]
     response = eqx.filter_jit(partial(jl.trace_scene, reverse=False))(setups[0], KEY)
     assert response.higher is not None

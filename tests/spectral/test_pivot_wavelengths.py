@@ -80,7 +80,7 @@ def test_a_batch_at_pivots_gives_the_batch(air):
         ground=jl.Ground(reflectance=optics(wavelength)[-1]),
         atmosphere=air,
     )
-    setup = jl.make_setup(lidar, scene, jl.plan(lidar, scene, max_orders=4, n_photons=1024))
+    setup = jl.make_setup(lidar, scene, jl.plan(lidar, scene, max_orders=4, n_photons=8192))
     response, model = jl.trace_scene(setup, jax.random.key(0)), make_waveform_model(setup)
     pivot_model = model.at_pivots()
     assert pivot_model.pivots is not None

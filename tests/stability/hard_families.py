@@ -285,7 +285,7 @@ def measure_crown():
             canopy=jl.Canopy(voxels, leaf=leaf, bark=p["bark_R"], hotspot=False), ground=ground
         )
 
-    settings = {"max_orders": 3, "n_photons": 64, "n_rays": 32, "window": (-45.0, 45.0), "bin_width": 1.0}
+    settings = {"max_orders": 3, "n_photons": 512, "n_rays": 32, "window": (-45.0, 45.0), "bin_width": 1.0}
     return simulation(
         build, CROWN, component_sums("shares", "all"), widest={"height": 4.5, "slope": 80.0}, **settings
     )
@@ -302,7 +302,7 @@ def measure_many_orders():
         canopy = jl.Canopy(voxels, leaf=jl.Isotropic(albedo=p["albedo"]), sides="periodic", hotspot=False)
         return single_sample_lidar(), jl.Scene(canopy=canopy, ground=jl.Ground(reflectance=p["rho"]))
 
-    settings = {"max_orders": 40, "n_photons": 64, "n_rays": 4, **SINGLE_SAMPLE}
+    settings = {"max_orders": 40, "n_photons": 512, "n_rays": 4, **SINGLE_SAMPLE}
     return simulation(build, MANY_ORDERS, component_sums("shares", "absorbed"), **settings)
 
 
@@ -317,7 +317,7 @@ def measure_plate_over_ground():
 
     settings = {
         "max_orders": PLATE_ORDERS,
-        "n_photons": 16384,
+        "n_photons": 131072,
         "widest": {"coverage": 0.5, "height": 12.0},
         **SINGLE_SAMPLE,
     }

@@ -102,7 +102,7 @@ CANOPIES = {
 
 
 def plan_of(lidar, scene, **changes):
-    settings = {"max_orders": 3, "n_photons": 64, "n_rays": 32, "window": (-45.0, 15.0), "bin_width": 1.0}
+    settings = {"max_orders": 3, "n_photons": 512, "n_rays": 32, "window": (-45.0, 15.0), "bin_width": 1.0}
     return jl.plan(lidar, scene, **(settings | changes))
 
 

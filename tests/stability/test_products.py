@@ -67,7 +67,7 @@ SCENES = {
 def test_simulations(name, derivatives, histories):
     lidar = jl.Lidar(wavelength=(532.0, 1064.0), pulse=jl.GaussianPulse(fwhm=4.0))
     scene = SCENES[name]
-    plan = jl.plan(lidar, scene, max_orders=2, n_photons=64, n_rays=64, histories=histories)
+    plan = jl.plan(lidar, scene, max_orders=2, n_photons=512, n_rays=64, histories=histories)
 
     def waveform(reflectance, key):
         changed = jl.Scene(scene.canopy, scene.plates, jl.Ground(reflectance=reflectance), scene.atmosphere)

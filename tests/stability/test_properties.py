@@ -107,7 +107,7 @@ def compiled(precision):
     plan = jl.plan(
         *build(arrays(widest)),
         max_orders=3,
-        n_photons=128,
+        n_photons=1024,
         n_rays=32,
         window=(-80.0, 120.0),
         footprint="fixed",

@@ -23,7 +23,7 @@ PLATES = jl.Scene(
     ground=jl.Ground(reflectance=0.3),
 )
 BETWEEN = dataclasses.replace(SCENE, plates=PLATES.plates)
-SIZES = {"n_photons": 2048, "n_rays": 512, "window": (-80.0, 40.0)}
+SIZES = {"n_photons": 16384, "n_rays": 512, "window": (-80.0, 40.0)}
 
 
 def samples(wave):
@@ -60,7 +60,7 @@ def test_light_between_two_plates_returns_by_both_paths(transmission):
     scene = jl.Scene(plates=(upper, lower))
     # From 400 km all light is vertical.
     lidar = single_sample_lidar()
-    plan = jl.plan(lidar, scene, max_orders=2, n_photons=4096, **SINGLE_SAMPLE)
+    plan = jl.plan(lidar, scene, max_orders=2, n_photons=32768, **SINGLE_SAMPLE)
     mean, stderr = batch_mean(lidar, scene, plan, seed=0, count=32, quantity=second_order)
     path_reflectance = 0.5 * 0.5 * 0.7 * 0.4 * 0.5
     assert agrees(mean, stderr, 2 * path_reflectance)

@@ -75,7 +75,7 @@ def estimates(request):
         divergence=2.0, pulse=jl.GaussianPulse(fwhm=4.0), zenith=zenith, azimuth=0.0, wavelength=1064.0
     )
     start = {name: jnp.asarray(value) for name, (value, _) in table.items()}
-    plan = jl.plan(lidar, build(start), max_orders=5, n_photons=8192, window=(-60.0, 80.0))
+    plan = jl.plan(lidar, build(start), max_orders=5, n_photons=65536, window=(-60.0, 80.0))
     time = np.arange(plan.n_samples) / 50.0
     moments = jnp.asarray(np.stack([np.ones_like(time), time, time**2], axis=1))
 
@@ -139,7 +139,7 @@ def test_forward_and_reverse_agree():
     _, table = SCENES["nadir, slope"]
     lidar = jl.Lidar(divergence=2.0, wavelength=1064.0)
     start = {name: jnp.asarray(value) for name, (value, _) in table.items()}
-    plan = jl.plan(lidar, build(start), max_orders=3, n_photons=256, n_rays=128, window=(-60.0, 40.0))
+    plan = jl.plan(lidar, build(start), max_orders=3, n_photons=2048, n_rays=128, window=(-60.0, 40.0))
     key = jax.random.key(0)
 
     def measure(p):

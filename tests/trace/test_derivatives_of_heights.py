@@ -162,7 +162,7 @@ def measures(case, view_of=None, window=WINDOW):
     """
     view, scene_of, middle, step, orders = case
     # The plan covers the highest and the lowest of the scenes.
-    plan = jl.plan(view, scene_of(middle + step), max_orders=orders, n_photons=8192, window=window)
+    plan = jl.plan(view, scene_of(middle + step), max_orders=orders, n_photons=65536, window=window)
 
     def measure(value, key):
         view_now = view if view_of is None else view_of(value)

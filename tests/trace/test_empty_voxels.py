@@ -56,7 +56,7 @@ def problem(build, orders, zenith=12.0, wavelength=1064.0, n_photons=8192):
     leaf, bark = (jnp.asarray(a, float) for a in (LEAF, BARK))
     lidar = jl.Lidar(divergence=2.0, zenith=zenith, wavelength=wavelength)
     plan = jl.plan(
-        lidar, build(leaf, bark), max_orders=orders, n_rays=16, n_photons=n_photons, window=(-60.0, 40.0)
+        lidar, build(leaf, bark), max_orders=orders, n_rays=16, n_photons=8 * n_photons, window=(-60.0, 40.0)
     )
 
     def loss(leaf, bark, key):
@@ -176,7 +176,7 @@ def test_tables_of_empty_voxels():
     """The second map is 1 where the first one is 0; room behind the map is not empty."""
     leaf, bark = (jnp.asarray(a, float) for a in (LEAF, BARK))
     scene, lidar = leaf_and_bark(leaf, bark), jl.Lidar()
-    plan = jl.plan(lidar, scene, max_orders=2, n_rays=16, n_photons=16)
+    plan = jl.plan(lidar, scene, max_orders=2, n_rays=16, n_photons=128)
     device_scene = build_device_scene(jl.make_setup(lidar, scene, plan))
     empty_voxels = EmptyVoxels.of(device_scene)
     assert int(empty_voxels.are_empty.sum()) == np.sum(LEAF == 0.0) + np.sum(BARK == 0.0)

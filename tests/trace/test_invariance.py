@@ -61,7 +61,7 @@ def build(shift=(0.0, 0.0, 0.0), turns=0, divide=1, zenith=20.0, pick=slice(None
 @pytest.fixture(scope="module")
 def reference_wave():
     lidar, scene = build()
-    plan = jl.plan(lidar, scene, n_photons=512, **SIZES)
+    plan = jl.plan(lidar, scene, n_photons=4096, **SIZES)
     return plan, jl.simulate(lidar, scene, key=KEY, plan=plan, n_photons=4096)
 
 
@@ -131,7 +131,7 @@ def test_moving_everything_sideways_changes_nothing(reference_wave):
 def test_empty_voxels_around_the_crown_change_nothing(reference_wave):
     _, wave = reference_wave
     lidar, scene = build(empty=3)
-    larger = jl.plan(lidar, scene, n_photons=512, **SIZES)
+    larger = jl.plan(lidar, scene, n_photons=4096, **SIZES)
     padded_wave = jl.simulate(lidar, scene, key=KEY, plan=larger, n_photons=4096)
     assert_alike(padded_wave.reflectance, wave.reflectance)
     for name, share in padded_wave.energy_budget.items():
@@ -144,7 +144,7 @@ def test_a_lower_scene_shifts_the_time(reference_wave):
     delay = 2 * 3.0 / (0.299792458 * np.cos(np.deg2rad(20.0)))
     lidar, scene = build(shift=(0.0, 0.0, -3.0))
     later = tuple(t + round(delay) for t in SIZES["window"])
-    shifted = jl.plan(lidar, scene, n_photons=512, **(SIZES | {"window": later}))
+    shifted = jl.plan(lidar, scene, n_photons=4096, **(SIZES | {"window": later}))
     lowered = jl.simulate(lidar, scene, key=KEY, plan=shifted, n_photons=4096)
     for a, b in zip(lowered.reflectance, wave.reflectance):
         assert float(a.sum()) == pytest.approx(float(b.sum()), rel=1e-3)
@@ -156,7 +156,7 @@ def order_sums(wave):
     return wave.components["first"].sum(axis=1), wave.components["higher"].sum(axis=1)
 
 
-BATCHES = {"max_orders": 4, "n_photons": 2048, "n_rays": 512, **SINGLE_SAMPLE}
+BATCHES = {"max_orders": 4, "n_photons": 16384, "n_rays": 512, **SINGLE_SAMPLE}
 
 
 @pytest.fixture(scope="module")
@@ -215,7 +215,7 @@ def test_within_a_transformation():
 def test_the_plan_is_a_value():
     """Equal scenes have equal plans, so that they share compiled programs."""
     lidar, scene = build()
-    first, second = (jl.plan(lidar, scene, n_photons=512, **SIZES) for _ in range(2))
+    first, second = (jl.plan(lidar, scene, n_photons=4096, **SIZES) for _ in range(2))
     assert first == second
     assert hash(first) == hash(second)
-    assert first != first.with_config(n_photons=513)
+    assert first != first.with_config(photons_per_batch=513)

@@ -141,7 +141,7 @@ def test_higher_orders_of_two_sheets(reverse):
     surface = two_sheets()
     pulse = jl.GaussianPulse(fwhm=SIGMA * np.sqrt(8 * np.log(2)))
     lidar = jl.Lidar(altitude=ALTITUDE, divergence=1e-3, pulse=pulse, sampling_interval=SAMPLE)
-    options = {"max_orders": ORDERS, "n_photons": 4096, "n_rays": 64, "window": (-80.0, 900.0)}
+    options = {"max_orders": ORDERS, "n_photons": 32768, "n_rays": 64, "window": (-80.0, 900.0)}
     plan = jl.plan(lidar, jl.Scene(meshes=(surface,)), describe=False, bin_width=2.0, **options)
 
     def measure(upper, through, lower, scale, tilt, key):

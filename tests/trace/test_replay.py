@@ -83,7 +83,9 @@ def problem(build, zenith, orders, n_rays=600, n_photons=300):
     geometry = INSIDE if zenith == "inside" else {"divergence": 2.0, "zenith": zenith}
     lidar = jl.Lidar(azimuth=0.0, wavelength=1064.0, **geometry)
     window = (-5.0, 60.0) if zenith == "inside" else (-60.0, 40.0)
-    plan = jl.plan(lidar, build(START), max_orders=orders, n_rays=n_rays, n_photons=n_photons, window=window)
+    plan = jl.plan(
+        lidar, build(START), max_orders=orders, n_rays=n_rays, n_photons=8 * n_photons, window=window
+    )
 
     def loss(p, key):
         setup = jl.make_setup(lidar, build(p), plan)
@@ -290,7 +292,7 @@ def test_first_order_alone_has_no_table_of_vertical_depths():
     scene, lidar = leaves_over_ground(START), jl.Lidar(divergence=2.0)
     is_built = []
     for orders in (1, 2):
-        plan = jl.plan(lidar, scene, max_orders=orders, n_rays=16, n_photons=16)
+        plan = jl.plan(lidar, scene, max_orders=orders, n_rays=16, n_photons=128)
         device_scene = build_device_scene(jl.make_setup(lidar, scene, plan), derivatives="all")
         is_built.append(device_scene.depth_above is not None)
     assert is_built == [False, True]

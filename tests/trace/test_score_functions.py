@@ -97,7 +97,7 @@ def tangents_and_scores(case: ScoreCase):
     start = jnp.asarray(np.asarray(START[case.unknowns]), jnp.result_type(float))
     seen = {"zenith": case.zenith, "azimuth": 0.0, "field_of_view": case.field_of_view}
     lidar = jl.Lidar(divergence=2.0, wavelength=(532.0, 1064.0), **seen)
-    sizes = {"max_orders": case.orders, "n_photons": 512, "n_rays": 128, "window": (-60.0, 80.0)}
+    sizes = {"max_orders": case.orders, "n_photons": 4096, "n_rays": 128, "window": (-60.0, 80.0)}
     plan = jl.plan(lidar, build(case, start), **sizes)
     key, directions = jax.random.key(3), jnp.eye(start.size, dtype=start.dtype)
 

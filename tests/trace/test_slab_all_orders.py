@@ -40,7 +40,7 @@ def simulated(tau, leaf, ground, orders, photons, seed=0):
         canopy=jl.Canopy(voxels, leaf=leaf, sides="periodic", hotspot=False),
         ground=jl.Ground(reflectance=ground),
     )
-    plan = jl.plan(FAR_LIDAR, scene, max_orders=orders, n_photons=photons // 32, n_rays=256, **SINGLE_SAMPLE)
+    plan = jl.plan(FAR_LIDAR, scene, max_orders=orders, n_photons=photons // 4, n_rays=256, **SINGLE_SAMPLE)
     (value, neglected), (stderr, _) = batch_mean(FAR_LIDAR, scene, plan, seed=seed, quantity=returned)
     return float(value), float(stderr), float(neglected)
 

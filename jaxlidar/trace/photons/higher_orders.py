@@ -162,7 +162,7 @@ class PhotonBatch:
     ):
         """`words`: the random words. `nodes`, `node_key`: about which light enters, and a key for that."""
         self.scene, self.nodes, self.node_key = scene, nodes, node_key
-        n_photons = scene.config.n_photons if nodes is None else nodes.n_photons
+        n_photons = scene.config.photons_per_batch if nodes is None else nodes.n_photons
         # The first two words shift the footprint of order one (`trace.response`) from the same key.
         # The next two shift the disc from which photons start, and every order and dimension takes a step and
         # a shift. The last ones are for derivatives alone.
@@ -358,7 +358,7 @@ def _send_photons(scene: DeviceScene, lane: UInt32[Array, "photons"], shift: Flo
     2. Move it with the geometry (derivatives alone), with the ratio of its density.
     3. Start above everything in the scene; the weight is 1 / (number of photons), zero for padding.
     """
-    n_photons, slopes = scene.config.n_photons, scene.slopes
+    n_photons, slopes = scene.config.photons_per_batch, scene.slopes
     n_wavelengths = 0 if scene.optics is None else scene.optics.shape[1]
     # Stratified in enclosed energy: every ring of equal energy gets one photon.
     fraction = (lane.astype(float) + shift[0]) / n_photons

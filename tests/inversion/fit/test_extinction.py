@@ -64,7 +64,7 @@ UNKNOWNS = [
 def model_of(scene, unknowns=UNKNOWNS, lidar=LIDAR, orders=3):
     """Return a model of few photons, and the unknowns' starting values."""
     bound = bind_unknowns(unknowns, scene)
-    sizes = {"n_photons": 256, "n_rays": 64, "window": (-60.0, 60.0), "describe": False}
+    sizes = {"n_photons": 2048, "n_rays": 64, "window": (-60.0, 60.0), "describe": False}
     plan = jl.plan(lidar, scene, max_orders=orders, **sizes)
     return ForwardModel(lidar, scene, plan, bound, KEY), flat_start(bound)
 
@@ -153,6 +153,6 @@ def test_layers_are_retrieved():
         noise=1e-5,
         key=KEY,
         max_orders=1,
-        n_rays=8192,
+        n_rays=1024,
     )
     np.testing.assert_allclose(fit.values["layers"], np.linspace(0.7, 1.3, LAYERS), atol=0.05)

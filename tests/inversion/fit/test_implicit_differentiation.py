@@ -182,7 +182,7 @@ def test_precision_is_the_inverse_of_the_covariance():
 @pytest.mark.slow
 def test_a_canopy_with_higher_orders():
     lidar = lidar_of()
-    options = {"noise": 0.001, "key": jax.random.key(1), "n_photons": 4096, "n_rays": 512, "max_orders": 3}
+    options = {"noise": 0.001, "key": jax.random.key(1), "n_photons": 4096, "n_rays": 64, "max_orders": 3}
 
     def scene(density=0.5, reflectance=0.3):
         lad = jnp.full((1, 1, 4), density)

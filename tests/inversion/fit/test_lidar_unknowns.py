@@ -13,7 +13,7 @@ import inversion
 import jaxlidar as jl
 from inversion import Unknown
 from inversion.fit.model import ForwardModel
-from inversion.fit.planning import TraceSizes, corner_cases, plan_for_bounds
+from inversion.fit.planning import corner_cases, plan_for_bounds
 from inversion.fit.unknowns import bind_unknowns, flat_start
 from jaxlidar.planning.plan_check import check_pulse, check_reach
 from tests.helpers import ask
@@ -23,8 +23,8 @@ SLOPE = 20.0
 SCENE = jl.Scene(ground=jl.Ground(reflectance=0.3, slope=SLOPE, aspect=270.0))
 LIDAR = jl.Lidar(altitude=500.0, divergence=8.0, zenith=5.0, azimuth=60.0, pulse=jl.GaussianPulse(5.0))
 TIME = np.arange(-40.0, 41.0)
-SIZES = TraceSizes(64, 1024, max_orders=1)
-FIRST_ORDER: Any = {"max_orders": 1, "n_rays": 8192, "n_photons": 8}
+SIZES = {"n_photons": 512, "n_rays": 1024, "max_orders": 1}
+FIRST_ORDER: Any = {"max_orders": 1, "n_rays": 1024, "n_photons": 8}
 # A step of the difference, and bounds, by path.
 STEPS = {
     "lidar.position": (0.05, (-5.0, 5.0)),
@@ -49,7 +49,7 @@ def jacobian():
     """Columns of all unknowns, and the waveform as a function of the lidar, by one plan."""
     unknowns = [Unknown(path, bounds=bounds) for path, (_, bounds) in STEPS.items()]
     bound = bind_unknowns(unknowns, SCENE, LIDAR)
-    plan = plan_for_bounds(LIDAR, SCENE, bound, TIME, SIZES)
+    plan = plan_for_bounds(LIDAR, SCENE, bound, TIME, **SIZES)
     columns = ForwardModel(LIDAR, SCENE, plan, bound, jax.random.key(0))(flat_start(bound)).jacobian[0]
 
     @eqx.filter_jit
@@ -170,7 +170,7 @@ def test_a_plan_serves_all_lidars_within_the_bounds():
     nadir = dataclasses.replace(LIDAR, zenith=0.0, pulse=jl.GaussianPulse(8.0))
     unknowns = [Unknown("lidar.zenith", bounds=(0.0, 10.0)), Unknown("lidar.pulse.fwhm", bounds=(2.0, 9.0))]
     bound = bind_unknowns(unknowns, SCENE, nadir)
-    plan = plan_for_bounds(nadir, SCENE, bound, TIME, SIZES)
+    plan = plan_for_bounds(nadir, SCENE, bound, TIME, **SIZES)
     own = jl.plan(nadir, SCENE, max_orders=1, window=(TIME[0], TIME[-1]))
     assert own.config.vertical
     assert not plan.config.vertical

@@ -123,7 +123,7 @@ def stand_density():
         ),
         Unknown("canopy.leaf.reflectance", bounds=(0.1, 0.6), name="leaf", prior=LogNormal(0.45, 0.1)),
     ]
-    options = {"noise": 2e-4, "time": time, "key": jax.random.key(1), "max_orders": 1, "n_rays": 64}
+    options = {"noise": 2e-4, "time": time, "key": jax.random.key(1), "max_orders": 1, "n_rays": 8}
     return ask(inversion.log_density, observed, LIDAR, stand((0.2, 0.2, 0.2), 0.1), unknowns, **options)
 
 
@@ -169,7 +169,7 @@ def test_a_scene_out_of_range_has_no_density():
     observed, time = noisy_record(stand(), 1e-3)
     # Leaves of a transmittance of 0.4 reflect 0.6 at most.
     unknown = Unknown("canopy.leaf.reflectance", bounds=(0.1, 0.9), name="leaf")
-    options = {"noise": 1e-3, "time": time, "key": jax.random.key(1), "max_orders": 1, "n_rays": 64}
+    options = {"noise": 1e-3, "time": time, "key": jax.random.key(1), "max_orders": 1, "n_rays": 8}
     density = ask(inversion.log_density, observed, LIDAR, stand(), [unknown], **options)
     assert np.isfinite(density(density.initial))
     value, gradient = jax.value_and_grad(density)(density.to_unconstrained({"leaf": 0.8}))
@@ -188,7 +188,7 @@ def test_a_scene_that_the_plan_does_not_reach_has_no_density(scene):
 
     # The plan serves the start and both bounds; between them the ground rises above the start of its rays.
     unknown = Unknown(apply=bulge, bounds=(0.0, 1.0), start=0.01, name="bulge")
-    options = {"noise": 1e-3, "time": time, "key": jax.random.key(1), "max_orders": 1, "n_rays": 64}
+    options = {"noise": 1e-3, "time": time, "key": jax.random.key(1), "max_orders": 1, "n_rays": 8}
     density = ask(inversion.log_density, observed, LIDAR, scene, [unknown], **options)
     x = density.to_unconstrained({"bulge": np.array([0.01, 0.5, 0.99])})
     values, gradients = jax.vmap(jax.value_and_grad(density))(x)
@@ -206,7 +206,7 @@ def test_optics_brighter_than_the_start_have_a_density():
         Unknown("canopy.leaf.reflectance", bounds=(0.05, 0.6), start=0.06, name="leaf"),
         Unknown("ground.height", bounds=(-1.0, 1.0), name="height"),
     ]
-    options = {"noise": 1e-3, "time": time, "key": jax.random.key(1), "n_photons": 64, "n_rays": 64}
+    options = {"noise": 1e-3, "time": time, "key": jax.random.key(1), "n_photons": 64, "n_rays": 8}
     density = ask(inversion.log_density, observed, LIDAR, stand(), unknowns, **options)
     corners = density.to_unconstrained({"leaf": np.array([0.059, 0.59]), "height": np.array([-0.99, 0.99])})
     assert np.all(np.isfinite(jax.vmap(density)(corners)))

@@ -9,7 +9,7 @@ import inversion.fit.model
 import jaxlidar as jl
 from inversion.fit.data import ObservedWaveform
 from inversion.fit.model import PILOT_BATCHES, Evaluation, ForwardModel
-from inversion.fit.planning import TraceSizes, plan_for_bounds
+from inversion.fit.planning import plan_for_bounds
 from inversion.fit.problem import BoundProblem
 from inversion.fit.recorder_model import RecorderModel
 from inversion.fit.retrieval_many import LockstepGroups, LockstepModel
@@ -139,7 +139,7 @@ def test_a_batch_that_is_not_finite_fails_the_fit():
 def model_and_lockstep_model():
     scene, time = start_scene(), np.arange(-60.0, 21.0)
     unknowns = bind_unknowns(UNKNOWNS[1:4:2], scene)
-    plan = plan_for_bounds(LIDAR, scene, unknowns, time, TraceSizes(128, 64, max_orders=2))
+    plan = plan_for_bounds(LIDAR, scene, unknowns, time, n_photons=1024, n_rays=64, max_orders=2)
     key = jax.random.key(0)
     problem = BoundProblem(
         numbers=range(3),
@@ -191,7 +191,7 @@ def test_a_lockstep_group_traces_the_batches_that_each_fit_requests(traced_batch
 def test_a_retrieval_with_pilot_evaluations_is_that_without(target, monkeypatch, traced_batches):  # noqa: F811
     def fit(seed):
         traced_batches.clear()
-        retrieval = retrieve_canopy(target, seed, start_scene(), n_photons=32768, n_rays=8192)
+        retrieval = retrieve_canopy(target, seed, start_scene(), n_photons=32768, n_rays=1024)
         return retrieval, len(traced_batches)
 
     fits_with_pilot = [fit(seed) for seed in range(3)]

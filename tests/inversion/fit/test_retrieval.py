@@ -12,7 +12,7 @@ import inversion
 import jaxlidar as jl
 from inversion import Unknown
 from inversion.fit.model import ForwardModel
-from inversion.fit.planning import TraceSizes, corner_cases, plan_for_bounds
+from inversion.fit.planning import corner_cases, plan_for_bounds
 from inversion.fit.solver import latin_hypercube
 from inversion.fit.uncertainty import estimate_covariance
 from inversion.fit.unknowns import bind_unknowns, optical_arrays
@@ -70,7 +70,7 @@ def target():
 def retrieve_canopy(target, seed, start, unknowns=UNKNOWNS, **options):
     wave, noise = target
     observed = wave.reflectance + noise * np.random.default_rng(seed).normal(size=noise.shape)
-    options = {"max_orders": 2, "n_photons": 8192, "n_rays": 2048, "key": jax.random.key(1), **options}
+    options = {"max_orders": 2, "n_photons": 8192, "n_rays": 256, "key": jax.random.key(1), **options}
     return ask(inversion.retrieve, observed, LIDAR, start, unknowns, noise=noise, time=wave.time, **options)
 
 
@@ -146,7 +146,7 @@ def test_the_tracer_does_not_read_optical_arrays():
         ground=jl.Ground(reflectance=jl.spectrum("soil-medium")),
         atmosphere=jl.Atmosphere(visibility=23.0),
     )
-    plan = jl.plan(LIDAR, scene, max_orders=2, n_photons=64, n_rays=64)
+    plan = jl.plan(LIDAR, scene, max_orders=2, n_photons=512, n_rays=64)
     optical = optical_arrays(scene)
     leaves, structure = jax.tree.flatten(scene)
     without_optics = jax.tree.unflatten(
@@ -394,8 +394,8 @@ def test_the_plan_serves_the_corners_of_the_bounds():
     ]
     bound = bind_unknowns(unknowns, scene)
     time = np.arange(-260.0, 60.0)
-    sizes = TraceSizes(64, 64, max_orders=2)
-    plan = plan_for_bounds(LIDAR, scene, bound, time, sizes)
+    sizes = {"n_photons": 512, "n_rays": 64, "max_orders": 2}
+    plan = plan_for_bounds(LIDAR, scene, bound, time, **sizes)
     assert plan.n_samples == time.size
     scenes = [corner for _, corner in corner_cases(LIDAR, scene, bound)]
     assert len(scenes) == 17
@@ -417,7 +417,7 @@ def test_the_plan_serves_the_corners_of_the_bounds():
     assert len(corner_cases(LIDAR, scene, bind_unknowns(unknowns, scene))) == 13
     high = [Unknown(lambda s: s.ground.height, bounds=(-1.0, 1000.0))]
     with pytest.raises(ValueError, match="at the bounds of the unknowns the scene is inadmissible: altitude"):
-        plan_for_bounds(LIDAR, scene, bind_unknowns(high, scene), time, sizes)
+        plan_for_bounds(LIDAR, scene, bind_unknowns(high, scene), time, **sizes)
 
 
 def test_covariance_of_a_linear_problem():

@@ -11,7 +11,7 @@ from scipy.optimize import lsq_linear
 
 import inversion
 import jaxlidar as jl
-from inversion.fit.planning import TraceSizes, plan_for_bounds
+from inversion.fit.planning import plan_for_bounds
 from inversion.fit.uncertainty import estimate_covariance
 from inversion.fit.unknowns import bind_unknowns, flat_start
 from inversion.scene import retrieval
@@ -172,7 +172,7 @@ def model():
     bound = [bound[0]._replace(start=jnp.asarray(0.5 * lad))]
     groups = _shot_groups((0.5, 2.0), (-0.1, 0.1), np.arange(24) // 8, 24, bound)
     time = np.arange(-40.0, 10.0)
-    plan = plan_for_bounds(survey, scene, bound, time, TraceSizes(2048, 8, 1))
+    plan = plan_for_bounds(survey, scene, bound, time, n_photons=16384, n_rays=8, max_orders=1)
     observed = random.uniform(0.0, 0.02, (24, 1, time.size))
     weight = random.uniform(10.0, 30.0, observed.shape)
     return SurveyModel(survey, scene, plan, bound, groups, observed, weight, jax.random.key(3)), observed
