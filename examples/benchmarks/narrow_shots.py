@@ -182,26 +182,28 @@ def by_tolerance(scene: jl.Scene) -> list[dict]:
 
 
 def flight(scene: jl.Scene, shots: int, rtol: float) -> dict:
-    """Return the cost of many shots in lines, with returns and LAZ files written."""
+    """Return the cost of many shots in lines, with returns written to one LAZ file line by line."""
     n_lines = max(round(shots / SHOTS_OF_LINE), 1)
     line = scan(SIDE, SHOTS_OF_LINE)
     keep = ("recorded", "stderr", "energy", "components")
     simulate(line, scene, rtol, keep=keep).returns("peak")
     stages = dict.fromkeys(("simulate", "returns", "files"), 0.0)
-    n_points = n_bytes = 0
+    n_points = 0
     with tempfile.TemporaryDirectory() as folder:
-        for number in range(n_lines):
-            path, times = Path(folder) / f"line_{number}.laz", [time.perf_counter()]
-            waves = simulate(line, scene, rtol, seed=number, keep=keep)
-            times.append(time.perf_counter())
-            returns = waves.returns("peak")
-            times.append(time.perf_counter())
-            returns.to_las(path)
-            times.append(time.perf_counter())
-            for name, seconds in zip(stages, np.diff(times)):
-                stages[name] += float(seconds)
-            n_points, n_bytes = n_points + len(returns.range), n_bytes + path.stat().st_size
-            path.unlink()
+        path = Path(folder) / "flight.laz"
+        with jl.io.LasWriter(path) as file:
+            for number in range(n_lines):
+                times = [time.perf_counter()]
+                waves = simulate(line, scene, rtol, seed=number, keep=keep)
+                times.append(time.perf_counter())
+                returns = waves.returns("peak")
+                times.append(time.perf_counter())
+                returns.to_las(file)
+                times.append(time.perf_counter())
+                for name, seconds in zip(stages, np.diff(times)):
+                    stages[name] += float(seconds)
+                n_points += len(returns.range)
+        n_bytes = path.stat().st_size
     n_shots = n_lines * len(line)
     return {
         "shots": n_shots,

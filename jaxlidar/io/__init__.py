@@ -15,7 +15,7 @@ from jaxlidar.io.gedi_level2 import read_gedi_l2a, read_gedi_l2b
 from jaxlidar.io.gedi_writer import write_gedi_l1b
 from jaxlidar.io.icesat2 import read_atl03, read_atl08
 from jaxlidar.io.inventory import read_inventory
-from jaxlidar.io.las import read_las, write_las
+from jaxlidar.io.las import LasWriter, read_las, write_las
 from jaxlidar.io.las_waveforms import read_las_waveforms, write_las_waveforms
 from jaxlidar.io.lvis import read_lvis_l1b, read_lvis_l2
 from jaxlidar.io.meshes import read_mesh
@@ -35,6 +35,7 @@ __all__ = [
     "Column",
     "FileWarning",
     "GediShot",
+    "LasWriter",
     "PointCloud",
     "Segment",
     "ShotTable",

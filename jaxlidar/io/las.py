@@ -3,6 +3,7 @@
 Source: LAS specification 1.4 (ASPRS).
 """
 
+import contextlib
 import os
 from collections.abc import Mapping
 from pathlib import Path
@@ -215,23 +216,121 @@ def write_las(
     >>> print(jaxlidar.io.read_las(path).position[:, 2])
     [12.5   0.25]
     """
-    path, coordinates = las_path(path, (".las", ".laz")), as_numpy(position, "position")
-    n = len(coordinates)
-    if intensity is not None:
-        intensity = np.round(as_numpy(intensity, "intensity"))
-    fields = {
-        "intensity": np.zeros(n) if intensity is None else intensity,
-        "return_number": np.ones(n, int) if return_number is None else return_number,
-        "number_of_returns": np.ones(n, int) if number_of_returns is None else number_of_returns,
-        "gps_time": np.zeros(n) if gps_time is None else gps_time,
-        "classification": np.zeros(n, int) if classification is None else classification,
-        "scan_angle": np.zeros(n) if scan_angle is None else scan_angle,
-        "point_source_id": np.zeros(n, int) if point_source is None else point_source,
-    }
-    system = None if crs is None else metric_system("crs", crs)
-    points = las_points(_FORMAT_6, coordinates, fields, system, extra or {})
-    with atomic_write(path) as draft:
-        write_points(points, draft, compressed=path.suffix.lower() == ".laz")
+    with LasWriter(path, crs=crs) as file:
+        file.write(
+            position,
+            intensity=intensity,
+            return_number=return_number,
+            number_of_returns=number_of_returns,
+            gps_time=gps_time,
+            classification=classification,
+            scan_angle=scan_angle,
+            point_source=point_source,
+            extra=extra,
+        )
+
+
+class LasWriter:
+    """A LAS 1.4 file (point format 6), or LAZ, that is written part by part.
+
+    A survey of any number of shots is written with the memory of one part: simulate some shots at a time, and
+    give the writer to `Waveforms.to_las` or `DiscreteReturns.to_las` in place of a path. Use it in a `with`
+    statement: at its end the file is complete, and replaces an existing one. After an error nothing is left.
+    It needs laspy, and lazrs for LAZ.
+
+    - `path`, `crs`: as for `write_las`.
+
+    **Raises:** as `write_las`; ValueError at the end where no part had a point.
+
+    **Example:** two parts of a survey.
+
+    >>> import pathlib, tempfile
+    >>> import jax, jaxlidar as jl
+    >>> survey = jl.Survey.grid(jl.Lidar(), low=(0, 0), high=(30, 0), spacing=10.0)
+    >>> path = pathlib.Path(tempfile.mkdtemp()) / "strip.laz"
+    >>> with jl.io.LasWriter(path) as file:
+    ...     for number, part in enumerate((survey[:2], survey[2:])):
+    ...         many = jl.simulate_many(part, jl.Scene(ground=jl.Ground()), key=jax.random.key(number))
+    ...         _ = many.to_las(file)
+    >>> print(len(jl.io.read_las(path).position))
+    4
+    """
+
+    def __init__(self, path: str | os.PathLike[str], *, crs: str | None = None):
+        self.path = las_path(path, (".las", ".laz"))
+        self._system = None if crs is None else metric_system("crs", crs)
+        self._files = contextlib.ExitStack()
+        self._draft: Path | None = None
+        # The header and the writer of laspy, from the first part on.
+        self._header: Any = None
+        self._writer: Any = None
+
+    def __enter__(self) -> "LasWriter":
+        self._draft = self._files.enter_context(atomic_write(self.path))
+        return self
+
+    def __exit__(self, *error: Any) -> None:
+        if error[0] is None and self._writer is None:
+            missing = ValueError(f"{self.path}: no part has a point; admissible is one point or more")
+            self._files.__exit__(type(missing), missing, None)
+            raise missing
+        self._files.__exit__(*error)
+
+    def write(
+        self,
+        position: Num[ArrayLike, "..."],
+        *,
+        intensity: Num[ArrayLike, "..."] | None = None,
+        return_number: Num[ArrayLike, "..."] | None = None,
+        number_of_returns: Num[ArrayLike, "..."] | None = None,
+        gps_time: Num[ArrayLike, "..."] | None = None,
+        classification: Num[ArrayLike, "..."] | None = None,
+        scan_angle: Num[ArrayLike, "..."] | None = None,
+        point_source: Num[ArrayLike, "..."] | None = None,
+        extra: Mapping[str, tuple[str, Num[ArrayLike, "..."]]] | None = None,
+    ) -> None:
+        """Write a part: one point or more, with the arguments of `write_las`.
+
+        **Raises:** as `write_las`; ValueError outside of a `with` statement, and for a part whose extra
+        numbers or kind of GPS time are other ones than those of the first.
+        """
+        if self._draft is None:
+            raise ValueError(f"{self.path} is not open; admissible is with LasWriter(...) as file")
+        coordinates = as_numpy(position, "position")
+        n = len(coordinates)
+        if intensity is not None:
+            intensity = np.round(as_numpy(intensity, "intensity"))
+        fields = {
+            "intensity": np.zeros(n) if intensity is None else intensity,
+            "return_number": np.ones(n, int) if return_number is None else return_number,
+            "number_of_returns": np.ones(n, int) if number_of_returns is None else number_of_returns,
+            "gps_time": np.zeros(n) if gps_time is None else gps_time,
+            "classification": np.zeros(n, int) if classification is None else classification,
+            "scan_angle": np.zeros(n) if scan_angle is None else scan_angle,
+            "point_source_id": np.zeros(n, int) if point_source is None else point_source,
+        }
+        offset = None if self._header is None else self._header.offsets
+        points = las_points(_FORMAT_6, coordinates, fields, self._system, extra or {}, offset=offset)
+        if self._header is None:
+            self._header, self._writer = points.header, self._open(self._draft, points.header)
+        if self._header.point_format != points.header.point_format:
+            raise ValueError("extra has other names than in the first part; admissible are the same in all")
+        if self._header.global_encoding.gps_time_type != points.header.global_encoding.gps_time_type:
+            raise ValueError(
+                f"gps_time is outside 0 to {_SECONDS_OF_WEEK} s in some parts alone; admissible is in all or "
+                "in none"
+            )
+        self._writer.write_points(points.points)
+
+    def _open(self, draft: Path, header: Any) -> Any:
+        """Return the writer of laspy; the file is complete when `_files` is closed."""
+        is_compressed = self.path.suffix.lower() == ".laz"
+        if is_compressed:
+            with required_for("writing LAZ"):
+                import lazrs  # noqa: F401
+        file = self._files.enter_context(draft.open("wb"))
+        writer = import_laspy("writing LAS").LasWriter(file, header, do_compress=is_compressed, closefd=False)
+        return self._files.enter_context(writer)
 
 
 def las_points(
@@ -240,12 +339,14 @@ def las_points(
     fields: dict[str, Any],
     system: CoordinateSystem | None,
     extra: Mapping[str, tuple[str, Any]] | None = None,
+    *,
+    offset: np.ndarray | None = None,
 ) -> Any:
     """Return points as a `laspy.LasData`, which is not written yet.
 
     **Arguments:** `position`: (n, 3) coordinates. `fields`: (n,) numbers by laspy's names; scan angles in
     degrees. `system`: the coordinate reference system of `position`; None for none. `extra`: as for
-    `write_las`.
+    `write_las`. `offset`: that of coordinates in the file; None: whole metres below all of them.
 
     **Raises:** ValueError for numbers that the point format does not hold.
     """
@@ -270,9 +371,10 @@ def las_points(
         if np.any(values != np.floor(values)):
             raise ValueError(f"{name} has values that are not whole numbers")
     is_geographic = system is not None and system.kind == "geographic"
-    scale, offset = np.array(_DEGREES if is_geographic else _MM), np.floor(position.min(axis=0))
+    scale = np.array(_DEGREES if is_geographic else _MM)
+    offset = np.floor(position.min(axis=0)) if offset is None else offset
     counts = np.round((position - offset) / scale)
-    if counts.max() >= 2**31:
+    if np.abs(counts).max() >= 2**31:
         spans = np.ptp(position, axis=0).tolist()
         raise ValueError(f"position spans {spans}; admissible is 2^31 steps of {scale.tolist()}")
     header = laspy.LasHeader(point_format=point_format, version="1.4")
@@ -311,15 +413,6 @@ def scan_angles(points: Any) -> np.ndarray:
     if "scan_angle" in points.point_format.dimension_names:
         return _SCAN_ANGLE_STEPS[1] * np.asarray(points["scan_angle"], float)
     return np.asarray(points["scan_angle_rank"], float)
-
-
-def write_points(points: Any, path: Path, *, compressed: bool = False) -> None:
-    """Write a `laspy.LasData`, compressed by lazrs or not. **Raises:** ImportError without lazrs."""
-    if compressed:
-        with required_for("writing LAZ"):
-            import lazrs  # noqa: F401
-    with path.open("wb") as file:
-        points.write(file, do_compress=compressed)
 
 
 def las_path(path: str | os.PathLike[str], endings: tuple[str, ...] = (".las",)) -> Path:

@@ -42,7 +42,6 @@ from jaxlidar.io.las import (
     las_points,
     point_format_of,
     scan_angles,
-    write_points,
 )
 from jaxlidar.io.las_header import LasHeader, read_header
 from jaxlidar.io.laz import decompress_points
@@ -542,7 +541,8 @@ def write_las_waveforms(
         for layout, number in writer.layouts.items():
             record = laspy.VLR(_USER.decode(), _BEFORE_FIRST_LAYOUT + number, "", _LAYOUT.pack(*layout))
             points.header.vlrs.append(record)
-        write_points(points, draft)
+        with draft.open("wb") as file:
+            points.write(file)
 
 
 class _PacketWriter:

@@ -47,7 +47,7 @@ from typing import Any, NamedTuple, TypeAlias, final
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Bool, Float, Int, Shaped
+from jaxtyping import Bool, Float, Int, Num, Shaped
 
 from jaxlidar._constants import SPEED_OF_LIGHT
 from jaxlidar._fields.checks import (
@@ -62,7 +62,7 @@ from jaxlidar._fields.checks import (
 )
 from jaxlidar._not_kept import NotKept
 from jaxlidar.io.airborne import AirborneShot, Returns, Segment
-from jaxlidar.io.las import write_las
+from jaxlidar.io.las import LasWriter, write_las
 from jaxlidar.progress import Progress, ProgressOption
 from jaxlidar.sensors.lidar import Lidar
 from jaxlidar.sensors.survey import Survey, beam_directions
@@ -193,7 +193,7 @@ class DiscreteReturns(eqx.Module):
         largest = max(1.0, float(np.max(self.reflectance, initial=0.0)))
         return np.round(np.maximum(self.reflectance, 0.0) * (_FULL_INTENSITY / largest)).astype(int)
 
-    def to_las(self, path: str | os.PathLike[str], *, crs: str | None = None) -> None:
+    def to_las(self, path: str | os.PathLike[str] | LasWriter, *, crs: str | None = None) -> None:
         """Write the returns as a LAS or LAZ file: version 1.4, point format 6.
 
         Points have return numbers, `classification`, `intensity`, GPS time (0 if unknown), scan angle, the
@@ -202,9 +202,11 @@ class DiscreteReturns(eqx.Module):
 
         **Arguments:**
 
-        - `path`: the file, which ends in ".las" or ".laz". Missing folders are created.
+        - `path`: the file, which ends in ".las" or ".laz". Missing folders are created. Or a
+          `jaxlidar.io.LasWriter`, to which the returns are added, if there are any: there an intensity of
+          65535 is a reflectance of one, and larger ones are refused.
         - `crs`: coordinate reference system of the scene, in metres, such as "EPSG:32633". Default None: not
-          known. This needs pyproj.
+          known, or that of the `LasWriter`. This needs pyproj.
 
         **Raises:** as `jaxlidar.io.write_las`; ValueError where there is no return, and for more than 15 of
         one shot (`max_returns` of `Waveforms.returns`).
@@ -221,30 +223,38 @@ class DiscreteReturns(eqx.Module):
         >>> print(cloud.position[:, 2].round(2), cloud.classification)
         [2.5 2.5] [2 2]
         """
+        if isinstance(path, LasWriter):
+            if crs is not None:
+                raise ValueError(f"crs = {crs!r} is given together with a LasWriter, which has its own")
+            if len(self):
+                intensity = _FULL_INTENSITY * np.maximum(self.reflectance, 0.0)
+                path.write(self.position, **self._point_fields(intensity))
+            return
         if len(self) == 0:
             raise ValueError(
                 f"{path}: the survey has no return to write: nothing in its {self.n_shots:,} shots reaches "
                 "the threshold; give a lower threshold to returns or to_las (min_reflectance to "
                 "true_returns), or write the waveforms with to_las_waveforms"
             )
-        write_las(
-            path,
-            self.position,
-            intensity=self.intensity,
-            return_number=self.number,
-            number_of_returns=self.n_returns,
-            gps_time=np.where(np.isnan(self.gps_time), 0.0, self.gps_time),
-            classification=self.classification,
-            scan_angle=self.scan_angle,
-            point_source=self.flight_line,
-            extra={
+        write_las(path, self.position, crs=crs, **self._point_fields(self.intensity))
+
+    def _point_fields(self, intensity: Num[np.ndarray, " returns"]) -> dict[str, Any]:
+        """Return the arguments of `write_las` beside positions."""
+        return {
+            "intensity": intensity,
+            "return_number": self.number,
+            "number_of_returns": self.n_returns,
+            "gps_time": np.where(np.isnan(self.gps_time), 0.0, self.gps_time),
+            "classification": self.classification,
+            "scan_angle": self.scan_angle,
+            "point_source": self.flight_line,
+            "extra": {
                 "width": ("full width at half maximum, ns", self.width),
                 "reflectance": ("apparent reflectance", self.reflectance),
                 "amplitude": ("peak energy per sample, J", self.amplitude),
                 "ground share": ("fraction scattered by ground", self.ground_share),
             },
-            crs=crs,
-        )
+        }
 
 
 # -- geometry ----------------------------------------------------------------------------------------------

@@ -17,6 +17,7 @@ from jaxlidar._text import NOTABLE_FRACTION, percent
 from jaxlidar.io import netcdf
 from jaxlidar.io.case import Case
 from jaxlidar.io.datasets import datasets_of, keep_as_netcdf
+from jaxlidar.io.las import LasWriter
 from jaxlidar.io.las_waveforms import write_las_waveforms
 from jaxlidar.io.netcdf import WAVEFORM_QUANTITIES
 from jaxlidar.progress import ProgressOption, shows_progress
@@ -322,7 +323,7 @@ class Waveforms(eqx.Module):
 
     def to_las(
         self,
-        path: str | os.PathLike[str],
+        path: str | os.PathLike[str] | LasWriter,
         *,
         crs: str | None = None,
         detector: str | DetectorFunction = "peak",

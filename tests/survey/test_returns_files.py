@@ -20,10 +20,10 @@ SCENE = jl.Scene(
 LINE = {"start": (5e5, 5.2e6), "end": (5e5, 5.2e6 + 20.0), "speed": 40.0, "pulse_rate": 20.0}
 
 
-def simulate(gps_time=3.2e8):
+def simulate(gps_time=3.2e8, shots=slice(None)):
     lidar = jl.Lidar(altitude=500.0, pulse=jl.GaussianPulse(fwhm=4.0))
     survey = jl.Survey.scan(lidar, jl.Oscillating(20.0, 3.0), **LINE, gps_time=gps_time, flight_line=7)
-    return jl.simulate_many(survey, SCENE, key=jax.random.key(0), max_orders=1)
+    return jl.simulate_many(survey[shots], SCENE, key=jax.random.key(0), max_orders=1)
 
 
 @pytest.fixture(scope="module")
@@ -187,3 +187,53 @@ def test_numbers_that_point_formats_do_not_hold_are_refused(tmp_path):
     ):
         with pytest.raises(ValueError, match=message):
             jl.io.write_las(tmp_path / "a.las", point, **fields)
+
+
+@pytest.mark.parametrize("suffix", [".las", ".laz"])
+def test_a_file_in_parts_has_the_points_of_all(tmp_path, waveforms, suffix):
+    parts = simulate(shots=slice(0, 6)), simulate(shots=slice(6, None))
+    path = tmp_path / f"parts{suffix}"
+    with jl.io.LasWriter(path, crs=CRS) as file:
+        for part in parts:
+            part.to_las(file)
+    expected = []
+    for number, part in enumerate(parts):
+        part.to_las(tmp_path / f"{number}{suffix}")
+        expected.append(laspy.read(tmp_path / f"{number}{suffix}"))
+    cloud = laspy.read(path)
+    assert "UTM zone 33N" in cloud.header.parse_crs().name
+    np.testing.assert_allclose(cloud.xyz, np.concatenate([np.asarray(c.xyz) for c in expected]), atol=1e-9)
+    np.testing.assert_allclose(cloud.header.maxs, cloud.xyz.max(axis=0), atol=1e-9)
+    for name in cloud.point_format.dimension_names:
+        if name not in "XYZ":
+            values = np.concatenate([np.asarray(c[name]) for c in expected])
+            np.testing.assert_array_equal(cloud[name], values, err_msg=name)
+
+
+def test_a_file_in_parts_is_complete_or_not_there(tmp_path, waveforms):
+    path, point = tmp_path / "parts.laz", np.zeros((1, 3))
+
+    def write(*parts):
+        with jl.io.LasWriter(path) as file:
+            for part in parts:
+                part(file)
+
+    def stop(file):
+        raise RuntimeError("interrupted")
+
+    with pytest.raises(RuntimeError, match="interrupted"):
+        write(waveforms.to_las, stop)
+    with pytest.raises(ValueError, match="no part has a point"):
+        write()
+    with pytest.raises(ValueError, match="is not open"):
+        jl.io.LasWriter(path).write(point)
+    for fields, message in (
+        ({"extra": {"height": ("m", np.ones(1))}}, "extra has other names"),
+        ({"gps_time": np.full(1, 3.2e8)}, "gps_time is outside 0 to 604800 s in some parts alone"),
+        ({"intensity": np.full(1, 65536)}, "intensity = 65536 is outside"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            write(lambda file: file.write(point), lambda file, fields=fields: file.write(point, **fields))
+    with pytest.raises(ValueError, match="together with a LasWriter"):
+        write(lambda file: waveforms.to_las(file, crs=CRS))
+    assert list(tmp_path.iterdir()) == []
