@@ -167,7 +167,8 @@ class CoordinateSystem:
         if self.crs is None or self.kind != "map" or all(units_agree(unit, 1.0) for unit in units):
             return self
         definition = self.crs.to_json_dict()
-        for system in definition.get("components", [definition.get("source_crs", definition)]):
+        for component in definition.get("components", [definition]):
+            system = component.get("source_crs", component)
             for axis in system["coordinate_system"]["axis"]:
                 axis["unit"] = "metre"
             # The code names the system in its own unit.

@@ -68,6 +68,16 @@ GEODETIC = (
     'AXIS["longitude",east,ORDER[2]],ANGLEUNIT["degree",0.017453292519943]]'
 )
 HEIGHTS = 'VERTCRS["NAVD88",VDATUM["NAVD88"],CS[vertical,1],AXIS["height",up],LENGTHUNIT["metre",1.0]]'
+# In international feet, with the shift of its datum to WGS 84.
+BOUND_FEET = (
+    'COMPD_CS["site",PROJCS["site",GEOGCS["site",DATUM["Potsdam",SPHEROID["Bessel 1841",6377397.155,'
+    '299.1528128],TOWGS84[598.1,73.7,418.2,0.202,0.045,-2.455,6.7]],PRIMEM["Greenwich",0],'
+    'UNIT["degree",0.0174532925199433]],PROJECTION["Transverse_Mercator"],'
+    'PARAMETER["latitude_of_origin",0],PARAMETER["central_meridian",9],PARAMETER["scale_factor",0.9996],'
+    'PARAMETER["false_easting",1640000],PARAMETER["false_northing",0],UNIT["foot",0.3048],'
+    'AXIS["Easting",EAST],AXIS["Northing",NORTH]],VERT_CS["site",VERT_DATUM["site",2005],'
+    'UNIT["foot",0.3048],AXIS["Up",UP]]]'
+)
 UNKNOWN_UNIT_OF_HEIGHTS = "+proj=utm +zone=33 +units=km"
 # Metres per unit of x and y, and per unit of z, by the content of the record.
 IN_METRES = {
@@ -80,6 +90,7 @@ IN_METRES = {
     "blanks before and after": (" \t\r\n" + wkt("EPSG:2225") + " \n", US_FOOT, US_FOOT),
     "a byte order mark": ("\ufeff" + wkt("EPSG:2225"), US_FOOT, US_FOOT),
     "Esri's text": (wkt("EPSG:2225", "WKT1_ESRI"), US_FOOT, US_FOOT),
+    "a bound system": (BOUND_FEET, FOOT, FOOT),
     "a local system": (LOCAL_FEET, FOOT, FOOT),
     "an engineering system": (ENGINEERING_FEET, FOOT, FOOT),
     "heights alone": (wkt("EPSG:6360"), US_FOOT, US_FOOT),
@@ -533,6 +544,16 @@ def test_feet_in_metres_are_at_the_same_place(tmp_path):
         in_feet = file.xy(1, 0)
     expected = project("EPSG:2225", "EPSG:4269", [in_feet[0]], [in_feet[1]])
     place = project(rasterio.CRS.from_user_input(name), "EPSG:4269", *terrain.origin.reshape(2, 1).tolist())
+    np.testing.assert_allclose(place, expected, rtol=0, atol=1e-8)
+
+
+def test_bound_systems_in_metres_are_at_the_same_place(tmp_path):
+    """A system and the shift of its datum, with heights, become metres together."""
+    terrain, name, _ = read_dem(write_tiff(tmp_path), crs=BOUND_FEET)
+    system = system_of_name("crs", name)
+    assert (system.horizontal, system.vertical) == (1.0, 1.0)
+    place = project(name, "EPSG:4326", *terrain.origin.reshape(2, 1).tolist())
+    expected = project(BOUND_FEET, "EPSG:4326", [600_005.0], [5_200_005.0])
     np.testing.assert_allclose(place, expected, rtol=0, atol=1e-8)
 
 
