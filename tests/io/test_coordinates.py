@@ -37,6 +37,7 @@ from tests.io.test_dem import ROWS, write_ascii_grid, write_tiff
 
 rasterio = pytest.importorskip("rasterio")
 project = pytest.importorskip("rasterio.warp").transform
+pyproj = pytest.importorskip("pyproj")
 
 FOOT, US_FOOT = 0.3048, 1200 / 3937
 POINTS = np.array([[10.0, 20.0, 5.0], [20.0, 20.0, 25.0]])
@@ -160,6 +161,8 @@ def las(folder, content, *, extended=False, number=None, scale=0.001, points=POI
         # The registry states 1 m between ETRS89 and WGS 84.
         ("EPSG:25833", "accuracy of the transformation from WGS 84 to ETRS89 / UTM zone 33N is 1 m"),
         (wkt("EPSG:25833"), "is 1 m"),
+        # A shift whose accuracy nobody states: of a datum that is "unknown", too.
+        ("+proj=utm +zone=33 +ellps=WGS84 +towgs84=0,0,0 +units=m", "is not known"),
         # A datum that no transformation leads to.
         (wkt("EPSG:32633").replace('DATUM["WGS_1984"', 'DATUM["survey of 1970"'), "is not known"),
     ],
@@ -180,6 +183,25 @@ def test_transformations_say_their_accuracy(tmp_path, crs, says):
         rtol=0,
         atol=1e-3,
     )
+
+
+@pytest.mark.parametrize(
+    ("zone", "says"),
+    [
+        ("EPSG:32633", "a better one needs a file that `projsync --file us_nga_egm96"),
+        ("EPSG:25833", "a better one needs a file that `projsync --file us_nga_egm96"),
+        # Of its ellipsoid nothing is asked.
+        ("+proj=utm +zone=33 +ellps=WGS84 +type=crs", ""),
+    ],
+)
+def test_heights_above_another_surface_are_not_known(zone, says):
+    """Without its grid, PROJ takes heights above the geoid for those above the ellipsoid."""
+    crs = pyproj.crs.CompoundCRS("zone and heights", [pyproj.CRS(zone), pyproj.CRS("EPSG:5773")])
+    place = np.array([[5e5], [5.3e6], [100.0]])
+    with pytest.warns(UserWarning, match=rf"^a\.csv: the accuracy .* is not known.*{says}"):
+        there = transform("a.csv", crs, "EPSG:4979", *place)
+    with pytest.warns(UserWarning, match=r"^a\.csv: the accuracy .* is not known"):
+        transform("a.csv", "EPSG:4979", crs, *there.T)
 
 
 def test_a_better_transformation_that_is_not_installed_is_named():
@@ -429,6 +451,13 @@ def test_geocentric_pulses_become_geographic(tmp_path, place):
     back = read_las_waveforms(tmp_path / "a.las")[0]
     assert back.is_geographic
     assert back.zenith == pytest.approx(25.0, abs=0.02)
+
+
+def test_geocentric_pulses_of_another_datum_are_warned_of(tmp_path):
+    of_etrs89 = keys(k1024=3, k2048=4258, k3076=9001)
+    path = geocentric_flight((16.2, 47.7, 350.0), 25.0, 130.0, of_etrs89, tmp_path)
+    with pytest.warns(UserWarning, match=r"a\.pls: pulses: the accuracy of .* to WGS 84 is 1 m"):
+        read_pulsewaves(path)
 
 
 def test_geocentric_pulses_that_are_not_declared_are_refused(tmp_path):
