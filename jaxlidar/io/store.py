@@ -262,6 +262,12 @@ class StoredRows:
         return [(number, files[number]) for number in sorted(damaged)]
 
 
+def done_rows(root: Any) -> dict[str, np.ndarray]:
+    """Return which rows of a store are complete, by the path of their group: "/", "/fits", ..."""
+    parts = ((name.rpartition("/"), array) for name, array in root.members(max_depth=None))
+    return {f"/{group}": array[...] for (group, _, name), array in parts if name == DONE}
+
+
 def _values(variable: Any) -> np.ndarray:
     """Return the values of a variable, with texts of any length as objects, as zarr takes them."""
     return variable.values.astype(object) if variable.dtype.kind in "UT" else variable.values
@@ -294,7 +300,7 @@ def _attributes(dataset: Any, name: str) -> dict[str, Any]:
 
 @contextlib.contextmanager
 def replacing(path: Path) -> Iterator[None]:
-    """Keep runs out of a store while a complete result takes its place; of other files nothing is kept out.
+    """Keep runs out of a store while a complete result takes its place. Files of other kinds are not locked.
 
     **Raises:** ValueError for what is no store, and for the store of a run that has not ended. OSError for
     one that a run has open.
@@ -311,9 +317,9 @@ def replacing(path: Path) -> Iterator[None]:
                 if Path(f"{path}.lock").exists():
                     stack.enter_context(FileLock(f"{path}.lock", timeout=0))
                 root = zarr.open_group(path, mode="r", zarr_format=3, use_consolidated=False)
-                members: Any = root.members(max_depth=None) if PROBLEM in root.attrs else ()
-                done = [array[...] for name, array in members if name.rpartition("/")[2] == DONE]
-            if not all(map(np.all, done)):
+                # A run that has not written any row may not have its arrays yet.
+                is_done = done_rows(root).values() if PROBLEM in root.attrs else [True]
+            if not is_done or not all(map(np.all, is_done)):
                 raise ValueError(
                     f"path = {path} is the store of a run that has not ended; nothing is overwritten: give "
                     "another path, or remove the store"
