@@ -30,7 +30,7 @@ from typing import Any
 import numpy as np
 
 from jaxlidar._fields.checks import warn_user
-from jaxlidar.io.checks import DAMAGE_ERRORS
+from jaxlidar.io.checks import DAMAGE_ERRORS, required_for
 
 _SUFFIX = ".zarr"
 # The file that makes a folder a Zarr store of version 3.
@@ -63,16 +63,13 @@ def check_replaceable(path: Path) -> None:
 
 def import_packages(path: Path) -> None:
     """Import what a Zarr store, or otherwise a netCDF file, needs. **Raises:** ImportError."""
-    try:
+    with required_for("a Zarr store" if is_zarr(path) else "a netCDF file"):
         if is_zarr(path):
             import filelock  # noqa: F401
             import zarr  # noqa: F401
         else:
             import h5netcdf  # noqa: F401
         import xarray  # noqa: F401
-    except ImportError as error:
-        kind = "Zarr stores" if is_zarr(path) else "netCDF files"
-        raise ImportError(f"{kind} need {error.name}: pip install 'jaxlidar[io]'") from error
 
 
 def consolidate(path: Path) -> None:
