@@ -798,6 +798,7 @@ TRIANGLE = "v 0 0 0\nv 2 0 0\nv 0 1 0\nf 1 2 3\n"
         ("# Unit: inches", 0.0254),
         ("# units = 0.5 m", 0.5),
         ("# units are the user's affair", 1.0),
+        ("# Leaves of the beech, see the list of units: beech.txt", 1.0),
     ],
 )
 def test_units_of_meshes(tmp_path, comment, metres):
