@@ -81,8 +81,8 @@ _UNIT_TOLERANCE = 1e-8
 _SEMI_MAJOR_AXIS, _ECCENTRICITY2 = 6378137.0, 0.00669437999014
 # Longitude and latitude, and those with height above the ellipsoid, of WGS-84.
 GEOGRAPHIC, GEOGRAPHIC_3D = "EPSG:4326", "EPSG:4979"
-# Transformations less accurate than this, m, are warned of.
-_WARNED_ACCURACY = 0.1
+# A transformation is warned of whose accuracy, m, is coarser than this, or unknown.
+_COARSEST_ACCURACY = 0.1
 # No unit of length has this many metres; a degree, or a gradian, of latitude has some 1e5.
 _MIN_METRES_PER_ANGLE = 1e4
 # Elevations in m from which light returns: from the deepest trench to the highest clouds.
@@ -295,7 +295,7 @@ def transform(
     has_datums = _has_datum(source) and _has_datum(target)
     is_known = all(step.accuracy >= 0 or (_equates_datums(step) and not has_datums) for step in steps)
     accuracy = operation.accuracy if is_known else math.inf
-    if accuracy > _WARNED_ACCURACY:
+    if accuracy > _COARSEST_ACCURACY:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             group = pyproj.transformer.TransformerGroup(source, target, always_xy=True)

@@ -281,8 +281,8 @@ def _within(
 def _ascii(path: Path) -> _StoredGrid:
     """Read an ESRI ASCII grid, and with GDAL what files beside it declare.
 
-    GDAL (3.12) reads heights that are no numbers, or missing from the last row, as 0, takes 0 for an origin
-    that the header lacks, and skips heights beyond the last one.
+    GDAL reads heights that are no numbers as 0, takes 0 for an origin that the header lacks, and skips
+    heights beyond the last one.
     """
     _, lines = read_lines(path)
     # Text and line number of each entry of the header, which ends where a line begins with no keyword.

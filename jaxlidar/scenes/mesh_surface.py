@@ -401,7 +401,7 @@ def _check_origin(vertices: Float[np.ndarray, "m 3"], instances: MeshInstances) 
     """Refuse instances that rotate or scale a mesh in coordinates of a map about their distant origin.
 
     With m the middle of the mesh, rotation and scale displace it by e = s R m - m, and the shift d by d more.
-    A user who rotates about another point p has d = s (p - R p), which takes most of e back.
+    A user who rotates about another point p has d = p - s R p, which takes most of e back.
 
     **Raises:** ValueError with the place of the mesh and the displacement.
     """
