@@ -309,6 +309,14 @@ class MeshSurface(eqx.Module):
         placed = np.einsum("nij,vj->nvi", matrices, vertices) + concrete_array(places.shift)[:, None]
         return placed[:, faces].reshape(-1, 3, 3)
 
+    def some_corners(self, count: int) -> Float[np.ndarray, "triangles 3 3"]:
+        """Return the corners of some triangles, m, evenly among those of all instances, at most `count`."""
+        places, n_all = self.instances, len(self.faces) * len(self.instances)
+        instance, face = np.divmod(np.linspace(0, n_all - 1, min(count, n_all)).astype(int), len(self.faces))
+        matrices = _matrices(concrete_array(places.rotation), concrete_array(places.scale), np)[instance]
+        local = (concrete_array(self.vertices) + np.asarray(self.origin, float))[self.faces[face]]
+        return np.einsum("tij,tkj->tki", matrices, local) + concrete_array(places.shift)[instance, None]
+
     def local_corners(self) -> Float[np.ndarray, "triangles 3 3"]:
         """Return the corners of the triangles in coordinates of the mesh, m, before copies are placed."""
         return (concrete_array(self.vertices) + np.asarray(self.origin, float))[np.unique(self.faces, axis=0)]

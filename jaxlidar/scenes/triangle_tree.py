@@ -629,8 +629,8 @@ def _triangle_distance(
         p = permute(vec(a - b for a, b in zip(row[k : k + 3], x)))
         shift = shear_x * p[2], shear_y * p[2]
         seen = p[0] - shift[0], p[1] - shift[1], inverse * p[2]
-        difference = tuple(jnp.abs(shift[n]) + 2.0 * jnp.abs(seen[n]) for n in range(2))
-        return seen, difference
+        first, second = (jnp.abs(shift[n]) + 2.0 * jnp.abs(seen[n]) for n in range(2))
+        return seen, (first, second)
 
     corners = [seen_along_ray(k) for k in (0, 3, 6)]
     a, b, c = (seen for seen, _ in corners)
