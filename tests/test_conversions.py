@@ -7,6 +7,7 @@ import jax
 import numpy as np
 import pytest
 
+import inversion
 import jaxlidar as jl
 from jaxlidar._fields.checks import as_array, as_numpy, check_integer, check_range, concrete
 
@@ -43,3 +44,20 @@ def test_a_masked_node_of_a_terrain_is_refused():
     heights = np.ma.masked_equal(np.where(np.eye(3) > 0, -9999.0, 0.0), -9999.0)
     with pytest.raises(TypeError, match="heights is an array with masked elements"):
         jl.Terrain(heights, spacing=1.0)
+
+
+@pytest.mark.slow
+def test_types_are_promoted_by_the_package_itself():
+    """Within strict promotion: periods of canopies, and what retrievals trace."""
+    voxels = jl.VoxelMap.from_lad(np.full((2, 2, 3), 0.4), voxel_size=1.0)
+    canopy = jl.Canopy(voxels, leaf=jl.LeafOptics(0.4, 0.4), sides="periodic")
+    with jax.numpy_dtype_promotion("strict"):
+        scene = jl.Scene(canopy=canopy, ground=jl.Ground())
+        wave = jl.simulate(jl.Lidar(), scene, key=jax.random.key(0), max_orders=1, rtol=0.1)
+        assert wave.reflectance.sum() > 0
+        wave = jl.simulate(jl.Lidar(), jl.Scene(ground=jl.Ground(height=0.5)), key=jax.random.key(0))
+        height = inversion.Unknown(lambda s: s.ground.height, bounds=(-2.0, 2.0), name="height")
+        start = jl.Scene(ground=jl.Ground())
+        problem = inversion.Problem(wave.reflectance, jl.Lidar(), start, [height], noise=1e-3, time=wave.time)
+        fit = inversion.retrieve(problem, key=jax.random.key(0))
+        assert float(fit.values["height"]) == pytest.approx(0.5, abs=0.01)

@@ -71,11 +71,12 @@ def refuse_damage(refusal: str) -> Iterator[None]:
 def required_for(purpose: str, extra: str = "io") -> Iterator[None]:
     """Within the context, import packages of an extra.
 
-    **Raises:** ImportError that names the purpose, the package that is missing, and how to install it.
+    **Raises:** ImportError that names the purpose, the package that is missing, and how to install it. The
+    error of a package that is installed, but cannot be loaded, passes as it is.
     """
     try:
         yield
-    except ImportError as error:
+    except ModuleNotFoundError as error:
         raise ImportError(f'{purpose} needs {error.name}: pip install "jaxlidar[{extra}]"') from error
 
 

@@ -7,12 +7,13 @@ The annotations of a class decide what becomes of its fields:
 | array of shape "wavelengths bins" | a variable with these dimensions, or as a `ResultLayout` renames them |
 | array of shape "*shots bins" | the same, with the dimension "shots" for results that have that axis |
 | dict of such arrays | one variable with one more dimension, the first, whose coordinate has the keys |
-| dict of arrays of any shape, "..." | a variable "FIELD.NUMBER.KEY" for each, with the attribute `item`; its
-first dimension is the leading axis of results that have one |
+| dict of arrays of any shape, "..." | a variable "FIELD.NUMBER.KEY" for each, with the attribute `item` |
 | static field | an attribute, as JSON; a tuple of texts is a coordinate |
 | array or dict that is `NotKept` | the attribute null |
 | `Scene` or `Lidar` | an attribute, as TOML of a `Case`; its long arrays in the group "FIELD_arrays" |
 | object of another known class | the group of the field's name |
+
+Arrays of any shape have the leading axis of results that have one as their first dimension.
 
 `keep_as_netcdf` makes a class known, with the units and long names of its fields, so that other packages can
 add theirs. `jaxlidar.open` finds packages that are not imported yet by the entry points `jaxlidar.files`.
@@ -37,7 +38,7 @@ from jaxtyping import Bool
 
 from jaxlidar._not_kept import NotKept
 from jaxlidar.io.case import Case, case_of, case_text
-from jaxlidar.io.checks import refuse_damage
+from jaxlidar.io.checks import refuse_damage, required_for
 from jaxlidar.io.groups import StoredArray, StoredGroups
 from jaxlidar.io.kinds import admits_tuple
 from jaxlidar.io.toml import nearest
@@ -188,10 +189,8 @@ def datasets_of(result: Any, group: str = "/") -> dict[str, Any]:
 
     **Raises:** TypeError for values that no file can hold. ImportError where xarray is not installed.
     """
-    try:
+    with required_for("making datasets"):
         import xarray
-    except ImportError as error:
-        raise ImportError("datasets need xarray: pip install 'jaxlidar[io]'") from error
     layout = LAYOUTS[type(result).__name__]
     builder = _DatasetBuilder(layout, _has_leading_axis(result))
     inner_datasets: dict[str, Any] = {}

@@ -82,7 +82,7 @@ def read_dem(
     **Arguments:**
 
     - `path`: the file. A GeoTIFF's first band is read. The coordinate reference system of an ASCII grid lies
-      in a .prj file beside it. For both the package `rasterio` is needed, which the extra `io` installs.
+      in a .prj file beside it. For both the packages `rasterio` and `pyproj` are needed, of the extra `io`.
     - `bounds`: (west, south, east, north) in m: only nodes within are read. Default None: all.
     - `fill`: height, m, of nodes without data. Default None: such nodes are refused. They are those that the
       file declares, NaN, and numbers that stand for no data by custom: -9999, -99999, -32767, -32768 and the
@@ -95,9 +95,10 @@ def read_dem(
     **Returns:** a `DemRead`.
 
     **Raises:** FileNotFoundError where there is no such file; ImportError without `rasterio` where that is
-    needed. ValueError, naming the file and the place, for what is damaged; for nodes without data; for
-    coordinates in degrees, or a grid that is turned against north; for a unit that is not known, and heights
-    without a unit where x and y are not in metres; and for `bounds` with fewer than 2 x 2 nodes.
+    needed, or without `pyproj` where there is a coordinate reference system. ValueError, naming the file and
+    the place, for what is damaged; for nodes without data; for coordinates in degrees, or a grid that is
+    turned against north; for a unit that is not known, and heights without a unit where x and y are not in
+    metres; and for `bounds` with fewer than 2 x 2 nodes.
 
     **Source:** ESRI's ASCII raster format; OGC GeoTIFF 1.1.
 
@@ -280,8 +281,8 @@ def _within(
 def _ascii(path: Path) -> _StoredGrid:
     """Read an ESRI ASCII grid, and with GDAL what files beside it declare.
 
-    GDAL (3.12) reads heights that are no numbers, or missing from the last row, as 0, takes 0 for an origin
-    that the header lacks, and skips heights beyond the last one.
+    GDAL reads heights that are no numbers as 0, takes 0 for an origin that the header lacks, and skips
+    heights beyond the last one.
     """
     _, lines = read_lines(path)
     # Text and line number of each entry of the header, which ends where a line begins with no keyword.

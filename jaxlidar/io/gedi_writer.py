@@ -143,8 +143,8 @@ def write_gedi_l1b(
     survey, an unknown beam or `crs`, neither or both of `origin` and `crs`, and numbers outside their ranges.
     OSError for a path that cannot be written.
 
-    **Warns:** UserWarning where the transformation from `crs` to WGS-84 has a stated accuracy coarser than
-    0.1 m.
+    **Warns:** UserWarning where the transformation from `crs` to WGS-84 has an accuracy that is coarser than
+    0.1 m or unknown.
 
     **Source:** GEDI L1B product data dictionary (Dubayah et al. 2020, doi:10.5067/GEDI/GEDI01_B.002).
 
@@ -575,7 +575,7 @@ def _geolocation(
 
 def _longitude_latitude(projection: Any, position: Float[np.ndarray, "n 2"]) -> tuple[np.ndarray, np.ndarray]:
     """Return longitude and latitude on WGS-84. **Raises:** ValueError outside the projection."""
-    longitude, latitude = transform("position", projection, GEOGRAPHIC, *position.T).T
+    longitude, latitude = transform("crs", projection, GEOGRAPHIC, *position.T).T
     outside = ~(np.isfinite(longitude) & np.isfinite(latitude))
     if outside.any():
         shot = int(np.argmax(outside))

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from jaxlidar.io.checks import existing_file, refuse_damage
-from jaxlidar.io.store import DONE, PROBLEM, ROOT_FILE, consolidate, import_packages, is_zarr
+from jaxlidar.io.store import DONE, PROBLEM, ROOT_FILE, consolidate, done_rows, import_packages, is_zarr
 
 _HDF5_SIGNATURE = b"\x89HDF\r\n\x1a\n"
 # Arrays with rows up to this size are read at once, and are NumPy's.
@@ -124,7 +124,7 @@ def _open_zarr(path: Path) -> StoredGroups:
     with refuse_damage(f"{path}: damaged"):
         root = zarr.open_group(path, mode="r", zarr_format=3, use_consolidated=False)
         datasets = xarray.open_groups(path, engine="zarr", consolidated=False, chunks=None, **_RAW)
-        done = {group: d.variables[DONE].values for group, d in datasets.items() if DONE in d.variables}
+        done = done_rows(root)
     if PROBLEM in root.attrs and not done:
         raise ValueError(f"{path}: damaged (no array {DONE!r}, which says which rows a run has written)")
     for group, is_done in done.items():

@@ -1,6 +1,6 @@
 """Headers and variable length records of LAS and LAZ files; each size in them is compared with the file's.
 
-laspy (2.7) allocates and loops by the sizes that a header declares, reads the points before the end of a file
+laspy allocates and loops by the sizes that a header declares, reads the points before the end of a file
 that is cut short, and refuses files for text in records that nobody asks for.
 
 Source: LAS specification 1.4 (ASPRS). PulseWaves files have variable length records of the same kind.

@@ -113,7 +113,8 @@ def read_las_waveforms(path: str | os.PathLike[str]) -> AirborneShots:
 
     **Returns:** an `AirborneShots`, in the order of GPS time. Its `dropped` counts points "without a packet".
 
-    **Raises:** FileNotFoundError where there is no such file, or no .wdp file. ImportError without laspy.
+    **Raises:** FileNotFoundError where there is no such file, or no .wdp file. ImportError without laspy,
+    lazrs for LAZ, and pyproj for a declared coordinate reference system, or rasterio for one by GeoTIFF keys.
     ValueError, naming the file and the place (the record of a point), where it is damaged, cut short,
     declares more than it can hold, has no packets or compressed ones, and where a point's packet has an
     unknown layout or lies outside of the file, or its vector does not have the length that light goes; and

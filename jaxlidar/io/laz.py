@@ -1,9 +1,8 @@
 """Decompression of the points of LAZ files by lazrs.
 
-lazrs (0.8) allocates the memory that a file declares, and ends the process where that fails: of 1,000 files
-with random damage, laspy's reader died of 38, hung on 5 and asked for more memory than 256 MB for 48. So all
-declared sizes are checked first: those of the compression record, of the chunk table, and, from point format
-6 on, of the layers of each chunk, which hold one field each. All of them must fit into the file.
+lazrs allocates the memory that a file declares, and ends the process where that fails. So all declared sizes
+are checked first: those of the compression record, of the chunk table, and, from point format 6 on, of the
+layers of each chunk, which hold one field each. All of them must fit into the file.
 
 Two kinds of damaged bytes also end the process, and are refused:
 

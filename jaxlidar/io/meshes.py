@@ -1,8 +1,7 @@
 """Reader of triangle meshes: OBJ here, PLY, STL and glTF by the package trimesh.
 
-OBJ has a parser of its own: that of trimesh (5.2) drops the names of materials without an .mtl file, takes
-indices that count from the last vertex from the last one of the file, and fills lines that are damaged with
-other numbers, without a word.
+OBJ has a parser of its own: that of trimesh drops the names of materials without an .mtl file, and counts
+negative indices from the last vertex of the file in place of the last one before the face.
 """
 
 import os
@@ -30,8 +29,9 @@ _IGNORED_STATEMENTS = frozenset(
 )
 # Comments: after statements that name something, only where a blank precedes; names may have the sign.
 _COMMENT, _COMMENT_AFTER_NAME = re.compile(r"#.*"), re.compile(r"(^|\s)#.*")
-# A comment that names the unit of length, such as SketchUp's "# File units = meters"; PLY's have a keyword.
-_UNIT_COMMENT = re.compile(r"\s*(?:#|comment\b).*\bunits?\s*[:=]\s*(.*?)\s*$", re.IGNORECASE)
+# A comment that begins with the unit of length, such as SketchUp's "# File units = meters"; PLY's have a
+# keyword.
+_UNIT_COMMENT = re.compile(r"\s*(?:#|comment\b)\s*(?:\w+\s+)?units?\s*[:=]\s*(.*?)\s*$", re.IGNORECASE)
 _PLY_COUNT = re.compile(rb"^element\s+\w+\s+(\d+)", re.MULTILINE)
 # Bytes of a binary STL file before its triangles, and of each of them.
 _STL_HEADER, _STL_TRIANGLE = 84, 50

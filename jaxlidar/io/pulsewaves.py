@@ -105,7 +105,8 @@ def read_pulsewaves(path: str | os.PathLike[str]) -> AirborneShots:
     and the place, for one that is no PulseWaves file, is damaged, compressed, without pulses, or declares
     more than it can hold; when a shot is read, for waves that lie outside of the .wvs file, an unknown
     descriptor, a segment without samples, and a direction that does not have the length that light goes; and
-    for a coordinate reference system that is not known. ImportError without pyproj where one is declared.
+    for a coordinate reference system that is not known. ImportError without pyproj where one is declared, or
+    without rasterio where that is by GeoTIFF keys.
 
     **Source:** PulseWaves specification 0.3 (rapidlasso).
 
@@ -249,7 +250,8 @@ class _PulseWavesShots(AirborneShots):
         direction = counts * header.scale / (_TARGET_TIME * time_unit[:, None])
         if header.system.kind != "geocentric":
             return anchor, direction
-        return geographic_lines(header.system, anchor, direction, self._first_time(rows))
+        location = f"{self.path}: pulses"
+        return geographic_lines(location, header.system, anchor, direction, self._first_time(rows))
 
     def _first_time(self, rows: Any) -> np.ndarray:
         """Return the times of the first returning samples of pulses, ns, to the whole unit of time."""

@@ -9,8 +9,7 @@ import numpy as np
 from jaxtyping import ArrayLike
 
 from jaxlidar._fields.checks import as_numpy, check_kind, check_number, check_range, check_shape
-from jaxlidar.io.checks import required_for
-from jaxlidar.io.coordinates import metric_system
+from jaxlidar.io.coordinates import import_rasterio, metric_system
 from jaxlidar.io.files import atomic_write
 
 _TIFF = (".tif", ".tiff")
@@ -49,10 +48,10 @@ def write_raster(
 
     **Returns:** nothing.
 
-    **Raises:** ImportError where `rasterio` is not installed, which the extra `io` installs. ValueError for
-    values of another number, infinite ones, shots that are not on a grid or twice in one cell (without
-    `spacing`), no shot with a position, a `crs` that is not known or not in metres, and another kind of file.
-    OSError for a path that cannot be written.
+    **Raises:** ImportError where `rasterio`, or `pyproj` for `crs`, is not installed; the extra `io` installs
+    both. ValueError for values of another number, infinite ones, shots that are not on a grid or twice in one
+    cell (without `spacing`), no shot with a position, a `crs` that is not known or not in metres, and another
+    kind of file. OSError for a path that cannot be written.
 
     **Source:** OGC GeoTIFF 1.1.
 
@@ -67,8 +66,7 @@ def write_raster(
     >>> print(terrain.origin.tolist(), terrain.heights[:, 0].tolist())
     [0.0, 0.0] [18.0, 17.5, 19.0]
     """
-    with required_for("writing GeoTIFF"):
-        import rasterio
+    rasterio = import_rasterio("writing GeoTIFF")
     path = Path(path)
     if path.suffix.lower() not in _TIFF:
         raise ValueError(f"path = {path} ends in {path.suffix!r}; admissible are {', '.join(_TIFF)}")

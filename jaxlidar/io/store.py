@@ -30,7 +30,7 @@ from typing import Any
 import numpy as np
 
 from jaxlidar._fields.checks import warn_user
-from jaxlidar.io.checks import DAMAGE_ERRORS
+from jaxlidar.io.checks import DAMAGE_ERRORS, required_for
 
 _SUFFIX = ".zarr"
 # The file that makes a folder a Zarr store of version 3.
@@ -63,16 +63,13 @@ def check_replaceable(path: Path) -> None:
 
 def import_packages(path: Path) -> None:
     """Import what a Zarr store, or otherwise a netCDF file, needs. **Raises:** ImportError."""
-    try:
+    with required_for("a Zarr store" if is_zarr(path) else "a netCDF file"):
         if is_zarr(path):
             import filelock  # noqa: F401
             import zarr  # noqa: F401
         else:
             import h5netcdf  # noqa: F401
         import xarray  # noqa: F401
-    except ImportError as error:
-        kind = "Zarr stores" if is_zarr(path) else "netCDF files"
-        raise ImportError(f"{kind} need {error.name}: pip install 'jaxlidar[io]'") from error
 
 
 def consolidate(path: Path) -> None:
@@ -262,6 +259,12 @@ class StoredRows:
         return [(number, files[number]) for number in sorted(damaged)]
 
 
+def done_rows(root: Any) -> dict[str, np.ndarray]:
+    """Return which rows of a store are complete, by the path of their group: "/", "/fits", ..."""
+    parts = ((name.rpartition("/"), array) for name, array in root.members(max_depth=None))
+    return {f"/{group}": array[...] for (group, _, name), array in parts if name == DONE}
+
+
 def _values(variable: Any) -> np.ndarray:
     """Return the values of a variable, with texts of any length as objects, as zarr takes them."""
     return variable.values.astype(object) if variable.dtype.kind in "UT" else variable.values
@@ -294,7 +297,7 @@ def _attributes(dataset: Any, name: str) -> dict[str, Any]:
 
 @contextlib.contextmanager
 def replacing(path: Path) -> Iterator[None]:
-    """Keep runs out of a store while a complete result takes its place; of other files nothing is kept out.
+    """Keep runs out of a store while a complete result takes its place. Files of other kinds are not locked.
 
     **Raises:** ValueError for what is no store, and for the store of a run that has not ended. OSError for
     one that a run has open.
@@ -311,9 +314,9 @@ def replacing(path: Path) -> Iterator[None]:
                 if Path(f"{path}.lock").exists():
                     stack.enter_context(FileLock(f"{path}.lock", timeout=0))
                 root = zarr.open_group(path, mode="r", zarr_format=3, use_consolidated=False)
-                members: Any = root.members(max_depth=None) if PROBLEM in root.attrs else ()
-                done = [array[...] for name, array in members if name.rpartition("/")[2] == DONE]
-            if not all(map(np.all, done)):
+                # A run that has not written any row may not have its arrays yet.
+                is_done = done_rows(root).values() if PROBLEM in root.attrs else [True]
+            if not is_done or not all(map(np.all, is_done)):
                 raise ValueError(
                     f"path = {path} is the store of a run that has not ended; nothing is overwritten: give "
                     "another path, or remove the store"

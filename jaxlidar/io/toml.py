@@ -16,6 +16,7 @@ import jax
 import numpy as np
 
 from jaxlidar._fields.checks import is_traced, kind_of
+from jaxlidar.io.checks import required_for
 from jaxlidar.io.kinds import (
     ALTERNATIVE_ARGUMENTS,
     Argument,
@@ -259,10 +260,8 @@ def text_of(tables: Mapping[str, tuple[dict[str, Any], Callable[..., Any]]]) -> 
 
     **Raises:** ImportError where tomlkit is not installed.
     """
-    try:
+    with required_for("writing TOML"):
         import tomlkit
-    except ImportError as error:
-        raise ImportError("writing TOML needs tomlkit: pip install 'jaxlidar[io]'") from error
     document = tomlkit.document()
     for line in _HEADER:
         document.add(tomlkit.comment(line))

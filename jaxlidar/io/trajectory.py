@@ -98,8 +98,8 @@ def read_trajectory(path: str | os.PathLike[str], *, crs: str | None = None) -> 
     coordinates that are not on Earth; and what a `Trajectory` refuses. ImportError where `crs` is given and
     `pyproj`, of the extra `io`, is not installed.
 
-    **Warns:** UserWarning where longitude and latitude are transformed to a map of another datum with a
-    stated accuracy coarser than 0.1 m.
+    **Warns:** UserWarning where longitude and latitude are transformed to a map of another datum with an
+    accuracy that is coarser than 0.1 m or unknown.
 
     **Example:**
 

@@ -93,7 +93,7 @@ def mean_optical_depth(canopy: Canopy, xp: Any = np) -> Any:
     if xp is jnp:
         tables = [fixed_array(a, jnp) for a in (canopy.voxels.leaf, canopy.voxels.bark) if a is not None]
         columns = sum(table.sum(axis=2) for table in tables) * fixed_array(canopy.voxels.voxel_size, jnp)[2]
-        return columns.sum() / jnp.maximum((columns > 0).sum(), 1)
+        return columns.sum() / jnp.maximum((columns > 0).sum(dtype=columns.dtype), 1.0)
     extinction = np.zeros(canopy.voxels.shape[:2])
     for table in (canopy.voxels.leaf, canopy.voxels.bark):
         if table is None:

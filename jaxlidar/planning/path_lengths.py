@@ -182,7 +182,7 @@ class PathLengths:
             crossings += _mesh_crossings(mesh, *lines, repeats=scene.period is not None)
         if scene.canopy is not None:
             low = fixed_array(scene.canopy.voxels.origin, xp)[2]
-            for z in (low, low + self.size[2] * self.shape[2]):
+            for z in (low, low + self.size[2] * float(self.shape[2])):
                 crossed = (z - points[:, 2]) / self.rays[:, 2]
                 crossings.append((crossed, xp.ones_like(crossed, bool)))
         nearest, farthest = self._extremes(crossings, otherwise=0.0)
@@ -320,7 +320,7 @@ class PathLengths:
         if self.scene.canopy is None:
             return 0
         xp, least_cosine = self.xp, self._least_cosine
-        height = self.size[2] * self.shape[2]
+        height = self.size[2] * float(self.shape[2])
         rates = xp.abs(self.rays[:, :2]).max(0) / least_cosine * height / self.size[:2]
         columns = [self._ceil(rate) + 1 for rate in rates]
         if self.scene.canopy.sides == "open":
@@ -328,7 +328,7 @@ class PathLengths:
             columns = [xp.minimum(n, side) for n, side in zip(columns, self.shape)]
         longest = height / least_cosine
         if self.scene.canopy.sides == "open":
-            longest = xp.minimum(longest, xp.linalg.norm(self.size * self.shape))
+            longest = xp.minimum(longest, xp.linalg.norm(self.size * self.shape.astype(float)))
         divided = xp.where(max_segment >= self.longest_chord, 0, self._ceil(longest / max_segment))
         count = self.shape[2] + sum(columns) + divided + len(self.scene.surfaces) + 2
         return int(count) if xp is np else count
@@ -349,7 +349,7 @@ class PathLengths:
         # Let theta be the beam's zenith angle. A flight of s m within the canopy, up by at most its height,
         # comes closer to the sensor by at most s sin(theta) + height cos(theta). So it lengthens the path by
         # at least s (1 - sin(theta)) - height cos(theta).
-        height, cosine = self.size[2] * self.shape[2], self.xp.abs(self.rays[:, 2]).min()
+        height, cosine = self.size[2] * float(self.shape[2]), self.xp.abs(self.rays[:, 2]).min()
         sine = self.xp.linalg.norm(self.rays[:, :2], axis=1).max()
         return self._affordable((path + height * cosine) / self.xp.maximum(1.0 - sine, 0.1))
 
@@ -392,7 +392,7 @@ def _extent(terrain: Terrain, xp: Any) -> tuple[Any, Any]:
     if terrain.sides == "periodic":
         return xp.full(2, -np.inf), xp.full(2, np.inf)
     origin, spacing = fixed_array(terrain.origin, xp), fixed_array(terrain.spacing, xp)
-    return origin, origin + spacing * (np.asarray(terrain.heights.shape) - 1)
+    return origin, origin + spacing * (np.asarray(terrain.heights.shape, float) - 1.0)
 
 
 def _distances_to_box(start: Any, rays: Any, low: Any, high: Any) -> tuple[Any, Any]:

@@ -190,10 +190,10 @@ class MeshSurface(eqx.Module):
 
     **Raises:** ValueError for arrays of other shapes, no triangle with an area, more than 2^28 triangles,
     positions that are not finite, triangles so small and so far from the middle of their mesh that their
-    corners are rounded by more than 1 % of their edges, indices of vertices that do not exist, instances that
-    rotate or scale a mesh about a distant origin, optics outside [0, 1], names that the mesh does not have,
-    unknown units, and a mirror; TypeError for objects of another kind and for
-    vertices that JAX is tracing: make the surface outside, and replace its `vertices` by `equinox.tree_at`.
+    corners are rounded by more than 1 % of their edges and 0.1 mm, indices of vertices that do not exist,
+    instances that rotate or scale a mesh about a distant origin, optics outside [0, 1], names that the mesh
+    does not have, unknown units, and a mirror; TypeError for objects of another kind and for vertices that
+    JAX is tracing: make the surface outside, and replace its `vertices` by `equinox.tree_at`.
 
     **Example:** a roof over ground.
 
@@ -253,12 +253,14 @@ class MeshSurface(eqx.Module):
         # Relative to their middle, coordinates of millions of metres lose nothing in single precision.
         self.origin = np.round(0.5 * (vertices.min(axis=0) + vertices.max(axis=0)))
         self.vertices = as_array(vertices - self.origin)
-        _check_rounding(vertices - self.origin, faces, float(jnp.finfo(self.vertices.dtype).eps))
         order = tree_order(vertices[faces])
         self.faces = faces[order].astype(np.int32)
         numbers = np.searchsorted(np.unique(group), group) if by_material else np.zeros(len(faces), int)
         self.group = numbers[order].astype(np.int32)
         self.instances = MeshInstances(np.zeros((1, 3))) if instances is None else instances
+        known_scale = concrete(self.instances.scale)
+        scale = 1.0 if known_scale is None else float(known_scale.max())
+        _check_rounding(vertices - self.origin, faces, float(jnp.finfo(self.vertices.dtype).eps), scale)
         _check_origin(vertices, self.instances)
         self.period = None
 
@@ -306,6 +308,14 @@ class MeshSurface(eqx.Module):
         vertices = concrete_array(self.vertices) + np.asarray(self.origin, float)
         placed = np.einsum("nij,vj->nvi", matrices, vertices) + concrete_array(places.shift)[:, None]
         return placed[:, faces].reshape(-1, 3, 3)
+
+    def some_corners(self, count: int) -> Float[np.ndarray, "triangles 3 3"]:
+        """Return the corners of some triangles, m, evenly among those of all instances, at most `count`."""
+        places, n_all = self.instances, len(self.faces) * len(self.instances)
+        instance, face = np.divmod(np.linspace(0, n_all - 1, min(count, n_all)).astype(int), len(self.faces))
+        matrices = _matrices(concrete_array(places.rotation), concrete_array(places.scale), np)[instance]
+        local = (concrete_array(self.vertices) + np.asarray(self.origin, float))[self.faces[face]]
+        return np.einsum("tij,tkj->tki", matrices, local) + concrete_array(places.shift)[instance, None]
 
     def local_corners(self) -> Float[np.ndarray, "triangles 3 3"]:
         """Return the corners of the triangles in coordinates of the mesh, m, before copies are placed."""
@@ -401,7 +411,7 @@ def _check_origin(vertices: Float[np.ndarray, "m 3"], instances: MeshInstances) 
     """Refuse instances that rotate or scale a mesh in coordinates of a map about their distant origin.
 
     With m the middle of the mesh, rotation and scale displace it by e = s R m - m, and the shift d by d more.
-    A user who rotates about another point p has d = s (p - R p), which takes most of e back.
+    A user who rotates about another point p has d = p - s R p, which takes most of e back.
 
     **Raises:** ValueError with the place of the mesh and the displacement.
     """
@@ -424,15 +434,18 @@ def _check_origin(vertices: Float[np.ndarray, "m 3"], instances: MeshInstances) 
         )
 
 
-def _check_rounding(vertices: Float[np.ndarray, "m 3"], faces: Int[np.ndarray, "n 3"], eps: float) -> None:
+def _check_rounding(
+    vertices: Float[np.ndarray, "m 3"], faces: Int[np.ndarray, "n 3"], eps: float, scale: float
+) -> None:
     """Refuse triangles whose corners are rounded by more than `_EDGE_ROUNDING` of their longest edge.
 
     Corners are kept in single precision, unless JAX is configured otherwise, from the middle of the mesh.
+    Instances multiply their rounding by `scale`, at most.
 
-    **Raises:** ValueError with the triangle, its edge, its distance and the rounding.
+    **Raises:** ValueError with the triangle, its edge, its distance and the rounding, in units of the mesh.
     """
     distance = np.abs(vertices).max(axis=1)[faces].max(axis=1)
-    suspects = np.flatnonzero(0.5 * eps * distance > _LEAST_ROUNDING)
+    suspects = np.flatnonzero(0.5 * eps * scale * distance > _LEAST_ROUNDING)
     corners = vertices[faces[suspects]]
     edge = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
     rounding = 0.5 * eps * distance[suspects]

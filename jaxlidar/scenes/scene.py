@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
+from scipy.ndimage import map_coordinates
 
 from jaxlidar._fields.checks import check_kind, concrete, concrete_array, has_tracers, kind_of
 from jaxlidar._fields.ranges import Range
@@ -27,6 +28,8 @@ from jaxlidar.sensors.lidar import Lidar
 # Smallest distance, m, between parallel planes. In single precision closer ones coincide, and it is not
 # defined which of them a ray meets first.
 MIN_GAP = 1e-4
+# Triangles of a mesh that are compared with a terrain.
+_TRIANGLES_ON_TERRAIN = 4096
 
 
 def _as_tuple(x: Any) -> Any:
@@ -51,8 +54,9 @@ class Scene(eqx.Module):
 
     **Raises:** TypeError for an argument of the wrong type; ValueError for a plate in the plane of the
     ground, of another plate, of a triangle or of a cell of the terrain, for a canopy with periodic sides
-    over terrain of another period, for one that lies below the terrain as a whole, and for meshes that are
-    wider than the period of a canopy or terrain with periodic sides, with which they repeat.
+    over terrain of another period, for one that lies below the terrain as a whole, for meshes that are wider
+    than the period of a canopy or terrain with periodic sides, with which they repeat, and for meshes most of
+    whose triangles follow the terrain and cross it.
 
     **Warns:** `MisplacedCanopyWarning` for plants below the terrain, or far above it.
 
@@ -106,6 +110,7 @@ class Scene(eqx.Module):
                     f"is unknown; admissible is {MIN_GAP:g} m or more"
                 )
         self._check_plates()
+        self._check_meshes_on_terrain()
 
     def _check_plates(self) -> None:
         """Refuse plates in the plane of triangles of a mesh, or of cells of a terrain.
@@ -131,6 +136,32 @@ class Scene(eqx.Module):
                         f"first is unknown; admissible is {MIN_GAP:g} m or more"
                     )
 
+    def _check_meshes_on_terrain(self) -> None:
+        """Refuse meshes that follow a terrain and cross it, such as triangles of its own heights.
+
+        Terrain is bilinear between its nodes, and triangles are flat: in each cell some of them would lie
+        above it and some below, and light would meet the ground or the mesh in patches. Of large meshes some
+        triangles are looked at. Single triangles, as of the floor of a house, may follow the terrain.
+        """
+        terrain = self.ground
+        if not isinstance(terrain, Terrain) or not terrain.relief or has_tracers((terrain, self.meshes)):
+            return
+        for n, mesh in enumerate(self.meshes):
+            corners = mesh.some_corners(_TRIANGLES_ON_TERRAIN)
+            eps = float(np.finfo(np.float32).eps)
+            tolerance = max(MIN_GAP, 8.0 * eps * float(np.abs(corners[..., 2]).max()))
+            follows = (np.abs(_clearance(terrain, corners)) < tolerance).all(axis=1)
+            if np.mean(follows) <= 0.5:
+                continue
+            edges = 0.5 * (corners + np.roll(corners, 1, axis=1))[follows]
+            clearance = _clearance(terrain, np.append(edges, edges.mean(axis=1, keepdims=True), axis=1))
+            low, high = float(clearance.min()), float(clearance.max())
+            if low < -tolerance and high > tolerance:
+                raise ValueError(
+                    f"meshes[{n}] follows the terrain, up to {-low:.2g} m below and {high:.2g} m above it: "
+                    "light would meet patches of both; give one of them, or lift the mesh above the terrain"
+                )
+
     @property
     def gap(self) -> Float[Array, ""] | None:
         """Smallest distance, m, between parallel planes of the scene; None with fewer than two planes."""
@@ -142,9 +173,9 @@ class Scene(eqx.Module):
         """Periods along x and y, m, of a canopy or terrain with periodic sides; None without."""
         if self.canopy is not None and self.canopy.sides == "periodic":
             voxels = self.canopy.voxels
-            return voxels.voxel_size[:2] * np.array(voxels.shape[:2])
+            return voxels.voxel_size[:2] * np.array(voxels.shape[:2], float)
         if isinstance(self.ground, Terrain) and self.ground.sides == "periodic":
-            return self.ground.spacing * np.array(self.ground.heights.shape)
+            return self.ground.spacing * np.array(self.ground.heights.shape, float)
         # Meshes know the period of what a simulation leaves out.
         return self.meshes[0].period if self.meshes else None
 
@@ -153,6 +184,14 @@ class Scene(eqx.Module):
         """All surfaces in the order in which the tracer numbers them: ground, plates, materials of meshes."""
         ground = () if self.ground is None else (self.ground,)
         return (*ground, *self.plates, *itertools.chain(*(mesh.surfaces for mesh in self.meshes)))
+
+
+def _clearance(terrain: Terrain, points: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n"]:
+    """Return the height of points above a terrain with relief, m; NaN beside it."""
+    heights, origin, spacing = (concrete_array(a) for a in (terrain.heights, terrain.origin, terrain.spacing))
+    nodes = np.moveaxis((points[..., :2] - origin) / spacing, -1, 0)
+    mode = "grid-wrap" if terrain.sides == "periodic" else "constant"
+    return points[..., 2] - map_coordinates(heights.astype(float), nodes, order=1, mode=mode, cval=np.nan)
 
 
 def _corners_of_cells(terrain: Terrain) -> Float[np.ndarray, "cells 4 3"]:

@@ -16,8 +16,9 @@ of the trail, the next node is the sibling of the ancestor k levels up, (n >> k)
 
 Rays meet triangles by signed areas of their edges, seen along the ray (Woop, Benthin and Wald 2013, J.
 Comput. Graph. Tech. 2(1), 65). Neighbours compute the area of a shared edge from the same numbers. An area
-counts as zero, and so as inside, within the rounding of its corners and of their products: fused
-multiplications, by which compilers make the areas of neighbours differ, then open no gap.
+counts as zero, and so as inside, within what fused multiplications, which compilers use where they can, may
+make the areas of neighbours differ by: no gap opens. A triangle that stands alone grows by that on each side,
+some 3e-8 times the distance that the ray has come across its largest component.
 
 Where triangles of several materials lie in one plane, nearer to one another than the rounding of their
 distances, rounding would mix the materials: a ray meets the one with the lowest number.
@@ -54,8 +55,9 @@ _NOWHERE = 1e35
 _LANES = 128
 # So few rays take less time one by one: a step of all lanes takes as long as about thirty of a single ray.
 _FEW = 24
-# Rounding of a signed area, in units of the floating-point precision and of its corners' coordinates.
-_AREA_ROUNDING = 2.0
+# By how much a signed area may be negative, in units of the precision and of a bound on the difference of two
+# compilations of it. That is in units of half the precision, and each of two neighbours needs a half of it.
+_AREA_ROUNDING = 0.25
 # Rounding of the distance of a triangle, in units of the floating-point precision and of coordinates, and the
 # largest rise of a triangle along a ray, over its width, by which it grows.
 _DISTANCE_ROUNDING, _MAX_RISE = 4.0, 100.0
@@ -618,23 +620,28 @@ def _triangle_distance(
     along_last = jnp.where(jnp.abs(direction[2]) > 0, direction[2], 1.0)
     shear_x, shear_y, inverse = direction[0] / along_last, direction[1] / along_last, 1.0 / along_last
 
-    def seen_along_ray(k: int) -> tuple[Vec, Scalar, Scalar]:
+    def seen_along_ray(k: int) -> tuple[Vec, tuple[Scalar, Scalar]]:
         """Return a corner, relative to the start, sheared so that the ray is the last axis.
 
-        Also its distance from the ray, and from the start of the ray, as sums of coordinates.
+        Also by how much two compilations of its first two coordinates may differ, in units of half the
+        precision: by the rounding of the product, and twice by that of the difference.
         """
         p = permute(vec(a - b for a, b in zip(row[k : k + 3], x)))
-        seen = p[0] - shear_x * p[2], p[1] - shear_y * p[2], inverse * p[2]
-        return seen, jnp.abs(seen[0]) + jnp.abs(seen[1]), jnp.abs(p[0]) + jnp.abs(p[1]) + jnp.abs(p[2])
+        shift = shear_x * p[2], shear_y * p[2]
+        seen = p[0] - shift[0], p[1] - shift[1], inverse * p[2]
+        first, second = (jnp.abs(shift[n]) + 2.0 * jnp.abs(seen[n]) for n in range(2))
+        return seen, (first, second)
 
     corners = [seen_along_ray(k) for k in (0, 3, 6)]
-    a, b, c = (seen for seen, _, _ in corners)
+    a, b, c = (seen for seen, _ in corners)
     areas, roundings = [], []
     for i, j in ((2, 1), (0, 2), (1, 0)):
-        (p, from_ray, size), (q, other_from_ray, other_size) = corners[i], corners[j]
+        (p, dp), (q, dq) = corners[i], corners[j]
         areas.append(p[0] * q[1] - p[1] * q[0])
-        bound = size * other_from_ray + other_size * from_ray
-        roundings.append(_AREA_ROUNDING * precision * bound)
+        x_of_q, y_of_q, x_of_p, y_of_p = (jnp.abs(v) for v in (q[0], q[1], p[0], p[1]))
+        difference = dp[0] * y_of_q + dp[1] * x_of_q + dq[0] * y_of_p + dq[1] * x_of_p
+        difference += 3.0 * (x_of_p * y_of_q + y_of_p * x_of_q)
+        roundings.append(_AREA_ROUNDING * precision * difference)
     is_inside = jnp.ones_like(z_largest)
     is_inside_reversed = is_inside
     for area, rounding in zip(areas, roundings):
@@ -653,7 +660,7 @@ def _triangle_distance(
     is_met &= (one_sided == 0) | (total * along_last > 0)
     # Corners are rounded, and so is where the ray meets the triangle: more by the rise of that along the ray.
     coordinates = sum((jnp.abs(v) for v in (*row[:3], *x)), start=jnp.zeros_like(total))
-    across = corners[0][1] + corners[1][1] + corners[2][1]
+    across = sum((jnp.abs(v[0]) + jnp.abs(v[1]) for v in (a, b, c)), start=jnp.zeros_like(total))
     rise = (highest - lowest) * across / jnp.where(has_area, jnp.abs(total), 1.0)
     rise = jnp.minimum(rise, _MAX_RISE * jnp.abs(inverse))
     rounding = _DISTANCE_ROUNDING * precision * coordinates * (jnp.abs(inverse) + rise)

@@ -270,7 +270,7 @@ def _make_model(
     model = WaveformModel(
         optics=setup_optics(setup),
         convolution=convolution,
-        time=as_array(plan.sample_start + sample_interval * np.arange(convolution.n_samples)),
+        time=as_array(plan.sample_start + sample_interval * np.arange(convolution.n_samples, dtype=float)),
         bin_start=as_array(bins.start),
         bin_width=as_array(bins.width),
         transmittance=None,

@@ -37,6 +37,7 @@ from tests.io.test_dem import ROWS, write_ascii_grid, write_tiff
 
 rasterio = pytest.importorskip("rasterio")
 project = pytest.importorskip("rasterio.warp").transform
+pyproj = pytest.importorskip("pyproj")
 
 FOOT, US_FOOT = 0.3048, 1200 / 3937
 POINTS = np.array([[10.0, 20.0, 5.0], [20.0, 20.0, 25.0]])
@@ -68,6 +69,16 @@ GEODETIC = (
     'AXIS["longitude",east,ORDER[2]],ANGLEUNIT["degree",0.017453292519943]]'
 )
 HEIGHTS = 'VERTCRS["NAVD88",VDATUM["NAVD88"],CS[vertical,1],AXIS["height",up],LENGTHUNIT["metre",1.0]]'
+# In international feet, with the shift of its datum to WGS 84.
+BOUND_FEET = (
+    'COMPD_CS["site",PROJCS["site",GEOGCS["site",DATUM["Potsdam",SPHEROID["Bessel 1841",6377397.155,'
+    '299.1528128],TOWGS84[598.1,73.7,418.2,0.202,0.045,-2.455,6.7]],PRIMEM["Greenwich",0],'
+    'UNIT["degree",0.0174532925199433]],PROJECTION["Transverse_Mercator"],'
+    'PARAMETER["latitude_of_origin",0],PARAMETER["central_meridian",9],PARAMETER["scale_factor",0.9996],'
+    'PARAMETER["false_easting",1640000],PARAMETER["false_northing",0],UNIT["foot",0.3048],'
+    'AXIS["Easting",EAST],AXIS["Northing",NORTH]],VERT_CS["site",VERT_DATUM["site",2005],'
+    'UNIT["foot",0.3048],AXIS["Up",UP]]]'
+)
 UNKNOWN_UNIT_OF_HEIGHTS = "+proj=utm +zone=33 +units=km"
 # Metres per unit of x and y, and per unit of z, by the content of the record.
 IN_METRES = {
@@ -80,6 +91,7 @@ IN_METRES = {
     "blanks before and after": (" \t\r\n" + wkt("EPSG:2225") + " \n", US_FOOT, US_FOOT),
     "a byte order mark": ("\ufeff" + wkt("EPSG:2225"), US_FOOT, US_FOOT),
     "Esri's text": (wkt("EPSG:2225", "WKT1_ESRI"), US_FOOT, US_FOOT),
+    "a bound system": (BOUND_FEET, FOOT, FOOT),
     "a local system": (LOCAL_FEET, FOOT, FOOT),
     "an engineering system": (ENGINEERING_FEET, FOOT, FOOT),
     "heights alone": (wkt("EPSG:6360"), US_FOOT, US_FOOT),
@@ -149,6 +161,8 @@ def las(folder, content, *, extended=False, number=None, scale=0.001, points=POI
         # The registry states 1 m between ETRS89 and WGS 84.
         ("EPSG:25833", "accuracy of the transformation from WGS 84 to ETRS89 / UTM zone 33N is 1 m"),
         (wkt("EPSG:25833"), "is 1 m"),
+        # A shift whose accuracy nobody states: of a datum that is "unknown", too.
+        ("+proj=utm +zone=33 +ellps=WGS84 +towgs84=0,0,0 +units=m", "is not known"),
         # A datum that no transformation leads to.
         (wkt("EPSG:32633").replace('DATUM["WGS_1984"', 'DATUM["survey of 1970"'), "is not known"),
     ],
@@ -169,6 +183,25 @@ def test_transformations_say_their_accuracy(tmp_path, crs, says):
         rtol=0,
         atol=1e-3,
     )
+
+
+@pytest.mark.parametrize(
+    ("zone", "says"),
+    [
+        ("EPSG:32633", "a better one needs a file that `projsync --file us_nga_egm96"),
+        ("EPSG:25833", "a better one needs a file that `projsync --file us_nga_egm96"),
+        # Of its ellipsoid nothing is asked.
+        ("+proj=utm +zone=33 +ellps=WGS84 +type=crs", ""),
+    ],
+)
+def test_heights_above_another_surface_are_not_known(zone, says):
+    """Without its grid, PROJ takes heights above the geoid for those above the ellipsoid."""
+    crs = pyproj.crs.CompoundCRS("zone and heights", [pyproj.CRS(zone), pyproj.CRS("EPSG:5773")])
+    place = np.array([[5e5], [5.3e6], [100.0]])
+    with pytest.warns(UserWarning, match=rf"^a\.csv: the accuracy .* is not known.*{says}"):
+        there = transform("a.csv", crs, "EPSG:4979", *place)
+    with pytest.warns(UserWarning, match=r"^a\.csv: the accuracy .* is not known"):
+        transform("a.csv", "EPSG:4979", crs, *there.T)
 
 
 def test_a_better_transformation_that_is_not_installed_is_named():
@@ -420,6 +453,13 @@ def test_geocentric_pulses_become_geographic(tmp_path, place):
     assert back.zenith == pytest.approx(25.0, abs=0.02)
 
 
+def test_geocentric_pulses_of_another_datum_are_warned_of(tmp_path):
+    of_etrs89 = keys(k1024=3, k2048=4258, k3076=9001)
+    path = geocentric_flight((16.2, 47.7, 350.0), 25.0, 130.0, of_etrs89, tmp_path)
+    with pytest.warns(UserWarning, match=r"a\.pls: pulses: the accuracy of .* to WGS 84 is 1 m"):
+        read_pulsewaves(path)
+
+
 def test_geocentric_pulses_that_are_not_declared_are_refused(tmp_path):
     path = geocentric_flight((16.2, 47.7, 350.0), 25.0, 130.0, None, tmp_path)
     with pytest.raises(ValueError, match=r"a\.pls: pulses: an elevation of 4\.69\d*e\+06 m"):
@@ -533,6 +573,16 @@ def test_feet_in_metres_are_at_the_same_place(tmp_path):
         in_feet = file.xy(1, 0)
     expected = project("EPSG:2225", "EPSG:4269", [in_feet[0]], [in_feet[1]])
     place = project(rasterio.CRS.from_user_input(name), "EPSG:4269", *terrain.origin.reshape(2, 1).tolist())
+    np.testing.assert_allclose(place, expected, rtol=0, atol=1e-8)
+
+
+def test_bound_systems_in_metres_are_at_the_same_place(tmp_path):
+    """A system and the shift of its datum, with heights, become metres together."""
+    terrain, name, _ = read_dem(write_tiff(tmp_path), crs=BOUND_FEET)
+    system = system_of_name("crs", name)
+    assert (system.horizontal, system.vertical) == (1.0, 1.0)
+    place = project(name, "EPSG:4326", *terrain.origin.reshape(2, 1).tolist())
+    expected = project(BOUND_FEET, "EPSG:4326", [600_005.0], [5_200_005.0])
     np.testing.assert_allclose(place, expected, rtol=0, atol=1e-8)
 
 
@@ -748,6 +798,7 @@ TRIANGLE = "v 0 0 0\nv 2 0 0\nv 0 1 0\nf 1 2 3\n"
         ("# Unit: inches", 0.0254),
         ("# units = 0.5 m", 0.5),
         ("# units are the user's affair", 1.0),
+        ("# Leaves of the beech, see the list of units: beech.txt", 1.0),
     ],
 )
 def test_units_of_meshes(tmp_path, comment, metres):

@@ -85,6 +85,24 @@ def test_damaged_grids_are_refused(tmp_path, changes, message):
         read_dem(write_ascii_grid(tmp_path, **changes))
 
 
+@pytest.mark.parametrize(
+    ("changes", "heights"),
+    [
+        ({"rows": [[1, 2, 3], [4, "a", 6]]}, [[1, 2, 3], [4, 0, 6]]),
+        ({"rows": [[1, 2, 3], [4, 5, 6, 7]]}, [[1, 2, 3], [4, 5, 6]]),
+        ({"xllcorner": None}, ROWS.tolist()),
+    ],
+)
+def test_gdal_reads_damaged_grids(tmp_path, changes, heights):
+    """Why ASCII grids have a parser here, which refuses them."""
+    rasterio = pytest.importorskip("rasterio")
+    path = write_ascii_grid(tmp_path, **changes)
+    with rasterio.open(path) as file:
+        assert file.read(1).tolist() == heights
+    with pytest.raises(ValueError, match=r"dem\.asc: line \d"):
+        read_dem(path)
+
+
 def test_geographic_and_truncated_tiffs_are_refused(tmp_path):
     with pytest.raises(ValueError, match="coordinates in degrees"):
         read_dem(write_tiff(tmp_path, crs="EPSG:4326"))

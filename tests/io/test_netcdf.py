@@ -15,6 +15,7 @@ from jaxtyping import Float
 import inversion
 import jaxlidar as jl
 from jaxlidar.io import datasets, groups
+from jaxlidar.io.checks import required_for
 from tests.io.test_store import flip_a_bit
 
 h5py = pytest.importorskip("h5py")
@@ -244,9 +245,14 @@ def test_a_class_of_another_package_is_loaded_by_its_entry_point(tmp_path, monke
 def test_missing_packages_are_named_with_the_extra_to_install(wave, tmp_path, monkeypatch, package, suffix):
     # Python raises an ImportError for such an entry.
     monkeypatch.setitem(sys.modules, package, None)
-    with pytest.raises(ImportError, match=rf"need {package}: pip install 'jaxlidar\[io\]'"):
+    with pytest.raises(ImportError, match=rf'needs {package}: pip install "jaxlidar\[io\]"'):
         wave.save(tmp_path / f"a{suffix}")
     assert list(tmp_path.iterdir()) == []
+
+
+def test_the_error_of_a_package_that_cannot_be_loaded_passes():
+    with pytest.raises(ImportError, match=r"^cannot import name 'nothing'"), required_for("reading"):
+        from math import nothing  # pyright: ignore[reportAttributeAccessIssue]  # noqa: F401
 
 
 def test_a_failed_write_leaves_the_old_file(wave, tmp_path):

@@ -193,6 +193,16 @@ def test_stores_of_runs_are_not_replaced_by_results(path):
         written(path)
 
 
+def test_the_store_of_a_run_without_rows_yet_is_not_replaced(tmp_path):
+    """A run locks its store and names its problem before it knows its arrays, and may be killed there."""
+    with open_store(tmp_path / "run.zarr", PROBLEM):
+        pass
+    wave = jl.simulate(jl.Lidar(), jl.Scene(ground=jl.Ground()), key=jax.random.key(0))
+    with pytest.raises(ValueError, match=r"run\.zarr is the store of a run that has not ended; nothing is"):
+        wave.save(tmp_path / "run.zarr")
+    assert written(tmp_path / "run.zarr", [(0,)])[0] == [0]
+
+
 def test_a_store_without_the_array_of_complete_rows_is_not_read(path):
     shutil.rmtree(path / "fits" / "done")
     with pytest.raises(ValueError, match=r"run\.zarr: damaged \(no array 'done'"):

@@ -121,6 +121,22 @@ def test_no_ray_slips_through_edges_or_corners(precision):
         assert np.all(distance < 5.0)
 
 
+def test_no_ray_from_far_away_slips_through_edges_or_corners():
+    """Triangles of some centimetres, from 400 m away, with rays in single precision."""
+    sphere = trimesh.creation.icosphere(subdivisions=5, radius=2.0)
+    random = np.random.default_rng(3)
+    on_edge = sphere.vertices[sphere.edges_unique]
+    fraction = random.uniform(0, 1, (len(on_edge), 1))
+    targets = np.concatenate([sphere.vertices, fraction * on_edge[:, 0] + (1 - fraction) * on_edge[:, 1]])
+    for start in ([300.0, 200.0, 150.0], [-90.0, 20.0, 400.0]):
+        w = targets - start
+        w /= np.linalg.norm(w, axis=1, keepdims=True)
+        # Rays that graze the sphere may pass beside it.
+        w = w[(targets * -w).sum(axis=1) > 0.1]
+        distance, _ = meet([jl.MeshSurface(sphere)], np.broadcast_to(start, w.shape), w)
+        assert np.all(distance < np.linalg.norm(start))
+
+
 def test_instances_are_scaled_rotated_and_shifted_copies():
     random = np.random.default_rng(2)
     mesh = trimesh.creation.icosphere(subdivisions=1, radius=1.0)
@@ -400,3 +416,57 @@ def test_the_largest_rounding_that_is_admitted_keeps_the_area():
     placed = jl.MeshSurface((corners, faces)).corners()
     area = 0.5 * np.linalg.norm(np.cross(*(placed[:, k] - placed[:, 0] for k in (1, 2))), axis=1)
     assert np.sort(area)[:2].sum() == pytest.approx(0.04**2, rel=0.02)
+
+
+def test_instances_magnify_the_rounding_of_corners():
+    if jnp.zeros(()).dtype == jnp.float64:
+        pytest.skip("double precision")
+    corners, faces = panel(2e3)
+    corners[:4] *= 0.05
+    jl.MeshSurface((corners, faces))
+    with pytest.raises(ValueError, match=r"2 triangles are rounded.*0.00283 m.*split the mesh"):
+        jl.MeshSurface((corners, faces), instances=jl.MeshInstances([[0.0, 0, 0]], scale=[10.0]))
+
+
+def needles(size, pitch=3.0, count=40):
+    """Corners of `count`^2 equilateral triangles, which stand apart, and the width of their field, m."""
+    random, width = np.random.default_rng(0), count * pitch * size
+    centre = np.stack(np.meshgrid(*[np.arange(count) * pitch * size] * 2, indexing="ij"), axis=-1).reshape(
+        -1, 2
+    )
+    angle = random.uniform(0.0, 2.0 * np.pi, len(centre))[:, None] + np.deg2rad([0.0, 120.0, 240.0])
+    level = centre[:, None] + size / np.sqrt(3.0) * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    return np.concatenate([level, size * random.uniform(-0.2, 0.2, (*angle.shape, 1))], axis=-1), width
+
+
+@pytest.mark.parametrize(
+    ("size", "distance", "zenith", "far"),
+    [
+        (1e-3, 300.0, 0.0, 0.0),
+        (5e-3, 300.0, 0.0, 0.0),
+        (1e-3, 30.0, 60.0, 0.0),
+        (5e-3, 300.0, 60.0, 0.0),
+        (1e-3, 100.0, 0.0, 200.0),
+        (1e-3, 100.0, 0.0, 1e3),
+    ],
+)
+def test_small_triangles_that_stand_apart_keep_their_area(size, distance, zenith, far):
+    """Millimetres, from hundreds of metres away, in a mesh whose middle is `far` m away.
+
+    With `far` = 0 they are an instance that is 50 km away from the other one.
+    """
+    corners, width = needles(size)
+    theta, count = np.deg2rad(zenith), 100_000
+    w = np.array([0.6 * np.sin(theta), 0.8 * np.sin(theta), -np.cos(theta)])
+    normal = 0.5 * np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    covered = np.abs(normal @ w).sum() / (width**2 * np.cos(theta))
+    if far:
+        corners = np.concatenate([corners, [[[2 * far, 0, 0], [2 * far + 1, 0, 0], [2 * far, 1, 0]]]])
+    shift = np.array([[5e4, 2e4, 0.0], [0.0, 0.0, 0.0]]) if not far else np.zeros((1, 3))
+    faces = np.arange(3 * len(corners)).reshape(-1, 3)
+    mesh = jl.MeshSurface((corners.reshape(-1, 3), faces), instances=jl.MeshInstances(shift))
+    target = np.random.default_rng(1).uniform(-1.5 * size, width - 1.5 * size, (count, 2))
+    x = np.c_[target, np.zeros(count)] - distance * w
+    distances, _ = meet([mesh.moved(-shift[0, :2])], x, np.broadcast_to(w, x.shape))
+    met, stderr = np.mean(distances < FAR), np.sqrt(covered * (1.0 - covered) / count)
+    assert abs(met - covered) < 4.0 * stderr

@@ -130,6 +130,54 @@ def test_a_plate_in_a_cell_of_the_terrain_is_refused():
     jl.Scene(plates=(jl.Plate(1.0, 0.3),), ground=terrain)
 
 
+def draped(relief, lift=0.0, origin=(0.0, 0.0), step=1, sides="open"):
+    """Return a terrain of random heights, and a mesh of two triangles for each `step` cells."""
+    heights, spacing = relief * np.random.default_rng(0).standard_normal((65, 65)), 0.5
+    terrain = jl.Terrain(heights, spacing=spacing, origin=origin, sides=sides, reflectance=GROUND)
+    number = np.arange(65 * 65).reshape(65, 65)[::step, ::step]
+    west, east = number[:-1], number[1:]
+    a, b, c, d = (n.ravel() for n in (west[:, :-1], east[:, :-1], east[:, 1:], west[:, 1:]))
+    places = np.asarray(origin) + spacing * np.stack(np.divmod(np.arange(65 * 65), 65), axis=1)
+    faces = np.concatenate([np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)])
+    return terrain, jl.MeshSurface((np.c_[places, heights.ravel() + lift], faces), reflectance=0.5)
+
+
+@pytest.mark.parametrize("change", [{}, {"origin": (5e5, 6e6)}, {"step": 2}, {"sides": "periodic"}])
+def test_a_mesh_of_the_terrain_s_own_heights_is_refused(change):
+    """It lies above the bilinear surface in one half of the cells, and below it in the other."""
+    terrain, mesh = draped(0.05, **change)
+    with pytest.raises(
+        ValueError, match=r"meshes\[0\] follows the terrain, up to 0\.\d+ m below and 0\.\d+ m"
+    ):
+        jl.Scene(ground=terrain, meshes=(mesh,))
+    # Level to 0.1 mm within each cell, and above the terrain.
+    for relief, lift in ((1e-5, 0.0), (0.05, 0.5)):
+        terrain, mesh = draped(relief, lift, **change)
+        jl.Scene(ground=terrain, meshes=(mesh,))
+
+
+def test_a_mesh_of_nearly_level_terrain_is_met_before_it():
+    terrain, mesh = draped(1e-5, origin=(-16.0, -16.0))
+    wave = jl.simulate(
+        jl.Lidar(zenith=30.0), jl.Scene(ground=terrain, meshes=(mesh,)), key=jax.random.key(0), max_orders=1
+    )
+    assert float(wave.reflectance.sum()) == pytest.approx(0.5 * np.cos(np.deg2rad(30.0)), rel=1e-3)
+    assert float(wave.components["ground"].sum()) == 0.0
+
+
+def test_copies_of_a_mesh_in_one_place_count_once():
+    reflectance, transmittance = 0.5, 0.4
+    expected = reflectance + transmittance**2 * GROUND / (1.0 - reflectance * GROUND)
+    mesh = sheet(
+        reflectance=reflectance,
+        transmittance=transmittance,
+        instances=jl.MeshInstances([[0.0, 0.0, 0.5], [3.0, 2.0, 0.5]]),
+    )
+    scene = jl.Scene(ground=jl.Ground(reflectance=GROUND), meshes=(mesh,))
+    budget = jl.energy_budget(jl.Lidar(), scene, key=jax.random.key(1), rtol=0.005)
+    assert abs(float(budget.returned[0]) - expected) < 4.0 * float(budget.stderr["returned"][0])
+
+
 @pytest.mark.parametrize("offset", [0.0, 5e-4, -5e-4])
 def test_a_sensor_in_a_triangle_is_refused(offset):
     scene = jl.Scene(ground=jl.Ground(), meshes=(sheet(5.0),))
