@@ -48,12 +48,30 @@ class OffMapWarning(UserWarning):
 
 
 def ground_heights(survey: Survey, scene: Scene, start_distance: float) -> Float[np.ndarray, " shots"]:
+    """Return the heights of the ground for a simulation, as `_heights_on_axes`.
+
+    **Raises:** ValueError for shots outside a ground of finite extent.
+    """
+    heights = _heights_on_axes(survey, scene, start_distance)
+    # A plane has no rim: an axis that does not meet it runs along it, and has no height. From a sensor it
+    # may go anywhere.
+    if scene.ground is None or isinstance(scene.ground.shape, Plane) or survey.has_sensor_position:
+        return heights
+    misses = np.flatnonzero(np.isnan(heights))
+    if misses.size:
+        numbers = ", ".join(map(str, misses[:5])) + (", ..." if misses.size > 5 else "")
+        raise ValueError(
+            f"position: {misses.size} of {len(survey)} shots do not meet the ground: shots {numbers}; "
+            "admissible are shots above it: ground_position is not NaN for those"
+        )
+    return heights
+
+
+def _heights_on_axes(survey: Survey, scene: Scene, start_distance: float) -> Float[np.ndarray, " shots"]:
     """Return the heights, m, of the ground where each beam axis meets it; NaN where it meets none.
 
     `survey` and `scene` have the same origin of coordinates. `start_distance`: distance, m, before the
     reference plane, along the beam, at which rays start: that of a plan.
-
-    **Raises:** ValueError for shots outside a ground of finite extent.
     """
     if scene.ground is None:
         return np.full(len(survey), np.nan)
@@ -64,15 +82,6 @@ def ground_heights(survey: Survey, scene: Scene, start_distance: float) -> Float
     distance = _distances(shape, start, survey.direction)
     # A miss is at FAR; a tenth of that leaves room for rounding.
     hits = distance < 0.1 * FAR
-    # A plane has no rim: an axis that does not meet it runs along it, and has no height. From a sensor it
-    # may go anywhere.
-    if not hits.all() and not isinstance(shape, Plane) and not survey.has_sensor_position:
-        misses = np.flatnonzero(~hits)
-        numbers = ", ".join(map(str, misses[:5])) + (", ..." if misses.size > 5 else "")
-        raise ValueError(
-            f"position: {misses.size} of {len(survey)} shots do not meet the ground: shots {numbers}; "
-            "admissible are shots above it"
-        )
     heights = start[:, 2] + np.where(hits, distance, 0.0) * survey.direction[:, 2]
     return np.where(hits, heights, np.nan)
 
@@ -113,8 +122,10 @@ def ground_position(survey: Survey, scene: Scene) -> Float[np.ndarray, "shots 3"
 
     **Returns:** (shots, 3) x, y and z, m; NaN where an axis meets no ground.
 
-    **Raises:** ValueError for shots with an altitude that do not meet a ground of finite extent; TypeError
-    for objects of the wrong type.
+    `Survey.subset` of the shots that are not NaN is what a simulation over open terrain admits, but for those at
+    its border whose footprints lie partly off it.
+
+    **Raises:** TypeError for objects of the wrong type.
 
     **Example:**
 
@@ -141,7 +152,7 @@ def ground_position(survey: Survey, scene: Scene) -> Float[np.ndarray, "shots 3"
         crossed, towards = ground.shape.crossing(*lines)
         met = towards < -_LEAST_COSINE
         start_distance = 1.0 - float(crossed[met].min()) if met.any() else 0.0
-    heights = ground_heights(survey, Scene(ground=ground), start_distance)
+    heights = _heights_on_axes(survey, Scene(ground=ground), start_distance)
     points = survey.aim_point + ((heights - survey.aim_point[:, 2]) / _off_level(axis[:, 2]))[:, None] * axis
     points[:, 2] = heights
     return points + np.append(np.zeros(2) if moved is None else origin, 0.0)
