@@ -201,65 +201,69 @@ class PhotonBatch:
 
     def trace_orders(self, lanes: Lanes, sums: Sums, trace_chunk: TraceChunk) -> tuple[Lanes, Sums]:
         """Trace all orders of a group of photons by `trace_chunk`, which adds to `sums`."""
-        scene, chunk_size = self.scene, self.chunk_size
-
-        def one_order(carry, order):
-            """Trace one order of all chunks.
-
-            1. Compact: find the new order of living photons.
-            2. Gather a chunk of photons in that order.
-            3. Trace it, if any of them lives, and put it in its place; chunk after chunk.
-            """
-            lanes, sums = carry
-            # Late orders have few photons left, and their paths differ in length: sorted, whole chunks are
-            # dead or end together, and can be skipped.
-            source, n_living = compact(scene, lanes.photons)
-            # Photons are gathered chunk by chunk, in their new order: a sort of the whole state would copy
-            # all of it through memory.
-            flat = jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:]), lanes)
-
-            def gather(chunk) -> Lanes:
-                number = source[chunk]
-                in_chunk = jax.tree.map(lambda a: a.at[number].get(mode="promise_in_bounds"), flat)
-                alive = chunk * chunk_size + jnp.arange(chunk_size) < n_living
-                return barrier(eqx.tree_at(lambda c: c.photons.alive, in_chunk, alive))
-
-            def trace(in_chunk, sums):
-                draws = PhotonDraws.from_numbers(self.lattices(in_chunk.lane, order), scene.n_plates)
-                return trace_chunk(in_chunk, sums, draws, order)
-
-            # Reverse mode traces each chunk again, and keeps the intermediate values of one at a time.
-            trace_again = jax.checkpoint(trace) if scene.reverse else trace
-
-            def skip(in_chunk, sums):
-                return in_chunk, sums
-
-            def scanned_chunk(sums, chunk):
-                in_chunk = gather(chunk)
-                any_alive = any_problem(in_chunk.photons.alive)
-                in_chunk, sums = lax.cond(any_alive, trace_again, skip, in_chunk, sums)
-                return sums, in_chunk
-
-            def looped_chunk(chunk, state):
-                lanes, sums = state
-                in_chunk, sums = trace(gather(chunk), sums)
-                return jax.tree.map(lambda a, b: a.at[chunk].set(b), lanes, in_chunk), sums
-
-            if scene.reverse:
-                # Chunks of dead photons are skipped. The loop has a static length, as reverse mode needs.
-                sums, lanes = lax.scan(scanned_chunk, sums, jnp.arange(self.chunks_per_group))
-                return lanes, sums
-            # Chunks of dead photons are not even looked at.
-            none_alive = jnp.zeros_like(lanes.photons.alive)
-            all_dead = eqx.tree_at(lambda c: c.photons.alive, lanes, none_alive)
-            n_living_chunks = -(-largest_count(n_living) // chunk_size)
-            return lax.fori_loop(0, n_living_chunks, looped_chunk, (all_dead, sums))
 
         def order_step(carry, order):
             # The loop is as long as its size bucket; orders beyond the plan's are passed over.
-            return lax.cond(order < scene.orders, one_order, lambda c, _: c, carry, order), None
+            def trace(lanes: Lanes, sums: Sums) -> tuple[Lanes, Sums]:
+                return self.trace_order(lanes, sums, trace_chunk, order)
 
-        return lax.scan(order_step, (lanes, sums), jnp.arange(scene.config.order_steps))[0]
+            return lax.cond(order < self.scene.orders, trace, lambda *carry: carry, *carry), None
+
+        return lax.scan(order_step, (lanes, sums), jnp.arange(self.scene.config.order_steps))[0]
+
+    def trace_order(
+        self, lanes: Lanes, sums: Sums, trace_chunk: TraceChunk, order: Int[Array, ""]
+    ) -> tuple[Lanes, Sums]:
+        """Trace one order of all chunks of a group.
+
+        1. Compact: find the new order of living photons.
+        2. Gather a chunk of photons in that order.
+        3. Trace it, if any of them lives, and put it in its place; chunk after chunk.
+        """
+        scene, chunk_size = self.scene, self.chunk_size
+        # Late orders have few photons left, and their paths differ in length: sorted, whole chunks are
+        # dead or end together, and can be skipped.
+        source, n_living = compact(scene, lanes.photons)
+        # Photons are gathered chunk by chunk, in their new order: a sort of the whole state would copy
+        # all of it through memory.
+        flat = jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:]), lanes)
+
+        def gather(chunk) -> Lanes:
+            number = source[chunk]
+            in_chunk = jax.tree.map(lambda a: a.at[number].get(mode="promise_in_bounds"), flat)
+            alive = chunk * chunk_size + jnp.arange(chunk_size) < n_living
+            return barrier(eqx.tree_at(lambda c: c.photons.alive, in_chunk, alive))
+
+        def trace(in_chunk, sums):
+            draws = PhotonDraws.from_numbers(self.lattices(in_chunk.lane, order), scene.n_plates)
+            return trace_chunk(in_chunk, sums, draws, order)
+
+        # Reverse mode traces each chunk again, and keeps the intermediate values of one at a time.
+        trace_again = jax.checkpoint(trace) if scene.reverse else trace
+
+        def skip(in_chunk, sums):
+            return in_chunk, sums
+
+        def scanned_chunk(sums, chunk):
+            in_chunk = gather(chunk)
+            any_alive = any_problem(in_chunk.photons.alive)
+            in_chunk, sums = lax.cond(any_alive, trace_again, skip, in_chunk, sums)
+            return sums, in_chunk
+
+        def looped_chunk(chunk, state):
+            lanes, sums = state
+            in_chunk, sums = trace(gather(chunk), sums)
+            return jax.tree.map(lambda a, b: a.at[chunk].set(b), lanes, in_chunk), sums
+
+        if scene.reverse:
+            # Chunks of dead photons are skipped. The loop has a static length, as reverse mode needs.
+            sums, lanes = lax.scan(scanned_chunk, sums, jnp.arange(self.chunks_per_group))
+            return lanes, sums
+        # Chunks of dead photons are not even looked at.
+        none_alive = jnp.zeros_like(lanes.photons.alive)
+        all_dead = eqx.tree_at(lambda c: c.photons.alive, lanes, none_alive)
+        n_living_chunks = -(-largest_count(n_living) // chunk_size)
+        return lax.fori_loop(0, n_living_chunks, looped_chunk, (all_dead, sums))
 
 
 def trace_higher_orders(

@@ -1,59 +1,25 @@
 """One step of photons, in the parts that all estimators share: fly, pass plates, collide.
 
-The response (`trace.photons.higher_orders`), absorption (`trace.photons.absorption`) and the estimator of
-the paper (`examples/paper`) follow photons in the same way, and differ in what they add to a tally on the
-way:
+The response (`trace.photons.higher_orders`), with the energy budget (`trace.photons.absorption`), and the
+estimator of the paper (`examples/paper`) follow photons in the same way, and differ in what they add to a
+tally on the way:
 
-1. `meet_surfaces` and `sample_flights` say where a flight ends (`trace.march.flight`); `fly_once` is both,
-   with independent random numbers and one end for each photon.
+1. `meet_surfaces` and `sample_flights` say where a flight ends (`trace.march.flight`).
 2. `passed_plates` says which plates the flight has passed, and which of these transmitted the photon.
 3. `collide` samples the collision at the end (`trace.photons.collisions`).
 """
 
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, PRNGKeyArray
+from jaxtyping import Array, Bool
 
 from jaxlidar._vectors import FAR, Scalar, Vec, along
-from jaxlidar.trace.device_scene import DeviceScene, not_scattered
-from jaxlidar.trace.march.flight import Flight, SurfaceEncounters, meet_surfaces, sample_flights
+from jaxlidar.trace.device_scene import DeviceScene
+from jaxlidar.trace.march.flight import Flight, SurfaceEncounters
 from jaxlidar.trace.photons.collisions import sample_collision
 from jaxlidar.trace.photons.photons import STOPPED, TRANSMITTED, Collision, Photons
 from jaxlidar.trace.photons.random_numbers import PhotonDraws
-
-
-def start_photons(x: Vec, w: Vec, path: Scalar) -> Photons:
-    """Return photons of the weight one, without a history, that start from no surface."""
-    zero = jnp.zeros(path.shape, jnp.int32)
-    return Photons(
-        x=x,
-        w=w,
-        path=path,
-        weight=jnp.ones_like(path),
-        history=zero,
-        surface=zero - 1,
-        last_scattering=not_scattered(path),
-        alive=zero == 0,
-    )
-
-
-def fly_once(
-    scene: DeviceScene, p: Photons, key: PRNGKeyArray, max_length: Float[Array, "photons"]
-) -> tuple[PhotonDraws, SurfaceEncounters, Flight]:
-    """Sample one flight of each photon, of at most `max_length`, m, with independent random numbers.
-
-    **Returns:** the numbers, for the collision; the surfaces ahead; and the flight.
-    """
-    # Not zero, whose logarithm would be an infinite optical depth.
-    tiny = jnp.finfo(p.weight.dtype).tiny
-    shape = (PhotonDraws.dimensions(scene.n_plates, return_path=False), p.weight.size)
-    uniform = jax.random.uniform(key, shape, p.weight.dtype, tiny)
-    draws = PhotonDraws.from_numbers(list(uniform), scene.n_plates)
-    encounters = meet_surfaces(scene, p, draws.plates_ahead)
-    flights = sample_flights(scene, p, encounters, max_length, draws.flight[None])
-    return draws, encounters, jax.tree.map(lambda a: a[0], flights)
 
 
 class PlatePassage(NamedTuple):
