@@ -463,8 +463,8 @@ def _trace_batch(
     returned = of_wavelengths(jnp.sum(higher.weights, axis=-1) + higher.outside, scene.histories)
     if is_hot_spot:
         # The first order knows its own path back.
-        first = trace_first(scene, key)
-        returned += of_wavelengths(jnp.sum(first.weights, axis=-1) + first.outside, scene.first_histories)
+        weights, outside = trace_first(scene, key)
+        returned += of_wavelengths(jnp.sum(weights, axis=-1) + outside, scene.first_histories)
     unfollowed = of_wavelengths(higher.flown_outside + higher.unfollowed, scene.histories)
     return returned / sun[2], unfollowed
 

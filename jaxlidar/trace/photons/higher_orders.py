@@ -45,7 +45,7 @@ from jaxlidar._constants import SPEED_OF_LIGHT
 from jaxlidar._jax.mesh_axes import vary_with
 from jaxlidar._jax.one_function import barrier
 from jaxlidar._jax.vmapped_loops import any_problem, largest_count
-from jaxlidar._vectors import FAR, Scalar, Vec, along
+from jaxlidar._vectors import FAR, Scalar, Vec
 from jaxlidar.trace.deposit import add_rows, bspline_row
 from jaxlidar.trace.derivatives.reparametrisation import (
     has_moving_landings,
@@ -57,7 +57,7 @@ from jaxlidar.trace.derivatives.score_functions import (
     collision_score,
     vertical_depth_slopes,
 )
-from jaxlidar.trace.device_scene import DeviceScene, not_scattered
+from jaxlidar.trace.device_scene import DeviceScene
 from jaxlidar.trace.first.footprint import GOLDEN, across_beam
 from jaxlidar.trace.march.flight import Flight, SurfaceEncounters, meet_surfaces, sample_flights
 from jaxlidar.trace.march.meshes import clear_of_mesh
@@ -65,7 +65,7 @@ from jaxlidar.trace.march.voxel_traversal import depth_to_top, march_to_depths
 from jaxlidar.trace.photons.collisions import collision_for_return, intensity_factors
 from jaxlidar.trace.photons.compaction import compact
 from jaxlidar.trace.photons.entry_nodes import EntryNodes
-from jaxlidar.trace.photons.photon_step import collide, passed_plates
+from jaxlidar.trace.photons.photon_step import collide, passed_plates, start_photons
 from jaxlidar.trace.photons.photons import (
     Collision,
     CollisionForReturn,
@@ -360,10 +360,9 @@ def _send_photons(scene: DeviceScene, lane: UInt32[Array, "photons"], shift: Flo
 
     1. Point across the beam: the enclosed fraction of energy in equal steps, the direction by golden angles.
     2. Move it with the geometry (derivatives alone), with the ratio of its density.
-    3. Start above everything in the scene; the weight is 1 / (number of photons), zero for padding.
+    3. The weight is 1 / (number of photons), zero for padding.
     """
-    n_photons, slopes = scene.config.photons_per_batch, scene.slopes
-    n_wavelengths = 0 if scene.optics is None else scene.optics.shape[1]
+    n_photons = scene.config.photons_per_batch
     # Stratified in enclosed energy: every ring of equal energy gets one photon.
     fraction = (lane.astype(float) + shift[0]) / n_photons
     # Turns by the golden angle, in 32-bit integers: floats would lose the fraction of large numbers.
@@ -371,22 +370,8 @@ def _send_photons(scene: DeviceScene, lane: UInt32[Array, "photons"], shift: Flo
     # Lanes beyond the last photon fill up chunks.
     is_real = lane < n_photons
     across, ratio = rays_with_grids(scene, across_beam(scene.beam, fraction, turn))
-    point, w, excess = scene.beam.ray(across)
-    # Photons start at a plane above everything in the scene, not at the sensor: positions stay small enough
-    # for single precision.
-    to_start = jnp.asarray(-scene.limits.start_distance, excess.dtype)
-    return Photons(
-        x=along(point, w, to_start),
-        w=w,
-        path=excess + to_start,
-        weight=jnp.where(is_real, ratio / n_photons, 0.0),
-        history=jnp.zeros(lane.shape, jnp.int32),
-        surface=jnp.full(lane.shape, -1, jnp.int32),
-        last_scattering=scene.if_differentiated(not_scattered(excess)),
-        alive=is_real,
-        optical_weights=tuple(jnp.ones_like(excess) for _ in range(n_wavelengths)),
-        score=None if slopes is None else jnp.zeros((*lane.shape, slopes.count)),
-    )
+    weight = jnp.where(is_real, ratio / n_photons, 0.0)
+    return start_photons(scene, across, weight, jnp.zeros(lane.shape, jnp.int32), is_real)
 
 
 class FlownPhotons(NamedTuple):

@@ -12,14 +12,47 @@ tally on the way:
 from typing import NamedTuple
 
 import jax.numpy as jnp
-from jaxtyping import Array, Bool
+from jaxtyping import Array, Bool, Int
 
-from jaxlidar._vectors import FAR, Scalar, Vec, along
-from jaxlidar.trace.device_scene import DeviceScene
+from jaxlidar._vectors import FAR, Scalar, Vec, along, dot
+from jaxlidar.trace.device_scene import DeviceScene, not_scattered
 from jaxlidar.trace.march.flight import Flight, SurfaceEncounters
 from jaxlidar.trace.photons.collisions import sample_collision
 from jaxlidar.trace.photons.photons import STOPPED, TRANSMITTED, Collision, Photons
 from jaxlidar.trace.photons.random_numbers import PhotonDraws
+
+
+def start_photons(
+    scene: DeviceScene,
+    entry: tuple[Scalar, Scalar],
+    weight: Scalar,
+    index: Int[Array, "photons"],
+    alive: Bool[Array, "photons"],
+) -> Photons:
+    """Start photons above everything in the scene, on the rays through `entry`, m across the beam.
+
+    `index`: the history, or the entry node, which takes its place.
+    """
+    point, w, excess = scene.beam.ray(entry)
+    # Not at the sensor: positions stay small enough for single precision.
+    to_start = jnp.asarray(-scene.limits.start_distance, excess.dtype)
+    # With shot views, times are relative to a shot whose axis goes through the point of entry:
+    # `ShotViews.seen_by_shots` adds the delay of each shot.
+    entry_path = 0.0 if scene.shot_views is None else 2.0 * dot(point, w)
+    n_wavelengths = 0 if scene.optics is None else scene.optics.shape[1]
+    return Photons(
+        x=along(point, w, to_start),
+        w=w,
+        path=excess + to_start - entry_path,
+        weight=weight,
+        history=index,
+        surface=jnp.full(index.shape, -1, jnp.int32),
+        last_scattering=scene.if_differentiated(not_scattered(excess)),
+        alive=alive,
+        optical_weights=tuple(jnp.ones_like(excess) for _ in range(n_wavelengths)),
+        entry_point=None if scene.shot_views is None else entry,
+        score=None if scene.slopes is None else jnp.zeros((*index.shape, scene.slopes.count)),
+    )
 
 
 class PlatePassage(NamedTuple):
