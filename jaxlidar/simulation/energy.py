@@ -2,8 +2,7 @@
 
 import dataclasses
 import time
-from collections.abc import Callable, Iterable
-from typing import Any, final
+from typing import final
 
 import equinox as eqx
 import jax
@@ -30,17 +29,14 @@ from jaxlidar.planning.size_buckets import size_bucket
 from jaxlidar.progress import Progress, ProgressOption, shows_progress
 from jaxlidar.sampling.adaptive import (
     BATCH_STEPS,
-    AbstractEstimate,
-    EstimateErrors,
     HasErrors,
+    MeanEstimate,
     StoppingRule,
     sample_until,
 )
-from jaxlidar.sampling.moments import RunningMoments
-from jaxlidar.scenes.canopy import Canopy
 from jaxlidar.scenes.scene import Scene, check_kinds
 from jaxlidar.sensors.lidar import Lidar
-from jaxlidar.sensors.survey import Survey
+from jaxlidar.simulation.reflectance import distance_above, parallel_lidar
 from jaxlidar.spectral.apply_optics import budget_excess, refuse_excess
 from jaxlidar.trace.device_scene import DeviceScene, build_device_scene
 from jaxlidar.trace.first.footprint import bistatic_beam
@@ -144,24 +140,28 @@ def energy_budget(
         raise ValueError("illumination = 'parallel'; that is admissible where the canopy has periodic sides")
     # Light is followed to its end: it may meet meshes that no ray of order one meets.
     effects = {"meshes": True} if scene.meshes else None
-    canopy = scene.canopy if illumination == "parallel" else None
-    shots = lidar if canopy is None else _corners_of_period(lidar, canopy)
-    plan = make_plan(shots, scene, max_orders=1, effects=effects, describe=False)
-    setup = _without_record(make_setup(lidar if isinstance(shots, Lidar) else shots.middle, scene, plan))
+    canopy, size = scene.canopy if illumination == "parallel" else None, np.zeros(2)
+    if canopy is not None:
+        size = concrete_array(canopy.voxels.voxel_size)[:2] * canopy.voxels.shape[:2]
+        centre = concrete_array(canopy.voxels.origin)[:2] + 0.5 * size
+        lidar = parallel_lidar(lidar.wavelength, lidar.zenith, lidar.azimuth, centre)
+    plan = make_plan(lidar, scene, max_orders=1, effects=effects, describe=False)
+    if canopy is not None:
+        plan = plan.with_limits(start_distance=distance_above(lidar, scene, size))
+    setup = _without_record(make_setup(lidar, scene, plan))
     start_time = time.perf_counter()
     # Built here: a program that took the setup would be compiled for every number of voxels.
     device_scene = build_device_scene(setup, derivatives="none")
     if canopy is not None:
-        # About the aim point, the middle of the period.
-        size = jnp.asarray(_size_of_period(canopy), float)
-        beam = bistatic_beam(setup.lidar, None, -0.5 * size, size)
+        # The aim point, the middle of the period, is the origin.
+        beam = bistatic_beam(setup.lidar, None, jnp.asarray(-0.5 * size, float), jnp.asarray(size, float))
         device_scene = dataclasses.replace(device_scene, beam=beam)
 
     def trace_batch(number: int) -> dict[str, Array]:
         return _compiled_trace(device_scene, jax.random.fold_in(key, number), max_orders)
 
     with side_by_side() as run:
-        estimate = _BudgetEstimate(lambda numbers: run(trace_batch, numbers))
+        estimate = MeanEstimate(lambda numbers: run(trace_batch, numbers))
 
         def report(errors: HasErrors) -> None:
             if callable(progress):
@@ -192,45 +192,6 @@ def energy_budget(
         wavelength=lidar.wavelength,
         info=info,
     )
-
-
-class _BudgetEstimate(AbstractEstimate):
-    """Moments of the energy fractions of batches of photons.
-
-    `trace`: traces the batches with the given numbers.
-    """
-
-    def __init__(self, trace: Callable[[range], Iterable[dict[str, Array]]]):
-        self.trace = trace
-        self.moments: Any = None
-
-    @property
-    def n_batches(self) -> int:
-        """Number of batches."""
-        return 0 if self.moments is None else self.moments.count
-
-    def add_batches(self, numbers: range) -> None:
-        """Trace batches and add them."""
-        for fractions in self.trace(numbers):
-            moments = RunningMoments.on_host(fractions) if self.moments is None else self.moments
-            self.moments = moments.update(fractions)
-
-    def errors(self) -> EstimateErrors:
-        """Return the largest standard error: it is relative to the emitted energy, which is one."""
-        stderr = jax.tree.leaves(self.moments.stderr)
-        return EstimateErrors(max(float(np.max(a, initial=0.0)) for a in stderr))
-
-
-def _size_of_period(canopy: Canopy) -> Float[np.ndarray, "2"]:
-    return concrete_array(canopy.voxels.voxel_size)[:2] * canopy.voxels.shape[:2]
-
-
-def _corners_of_period(lidar: Lidar, canopy: Canopy) -> Survey:
-    """Return shots of parallel light in a lidar's direction at the corners of a canopy's period."""
-    corners = [(0, 0), (1, 0), (0, 1), (1, 1)] * _size_of_period(canopy)
-    zenith, azimuth = lidar.zenith, lidar.azimuth
-    parallel = Lidar(lidar.wavelength, altitude=1e6, divergence=0.0, zenith=zenith, azimuth=azimuth)
-    return Survey(parallel, position=concrete_array(canopy.voxels.origin)[:2] + corners)
 
 
 def _without_record(setup: Setup) -> Setup:
