@@ -18,13 +18,16 @@ from jaxlidar.planning.setup import make_setup
 from jaxlidar.scenes.scene import Scene, check_kinds
 from jaxlidar.sensors.lidar import Lidar
 from jaxlidar.spectral.apply_optics import setup_optics
-from jaxlidar.trace.device_scene import DeviceScene, build_device_scene
+from jaxlidar.trace.device_scene import DeviceScene, build_device_scene, not_scattered
 from jaxlidar.trace.first.footprint import across_beam
+from jaxlidar.trace.march.flight import Flight, SurfaceEncounters, meet_surfaces, sample_flights
 from jaxlidar.trace.march.meshes import clear_of_mesh
-from jaxlidar.trace.photons.photon_step import collide, fly_once, passed_plates, start_photons
+from jaxlidar.trace.photons.photon_step import collide, passed_plates
 from jaxlidar.trace.photons.photons import Photons
+from jaxlidar.trace.photons.random_numbers import PhotonDraws
 
 PHOTONS_PER_CHUNK = 512
+_Vec = tuple[Array, Array, Array]
 
 
 class AnalogReturns(eqx.Module):
@@ -192,13 +195,45 @@ def _build_scene(lidar: Lidar, scene: Scene, plan: Plan) -> DeviceScene:
     return device_scene.with_leaf_transmittance(transmittance[0])
 
 
+def _start_photons(x: _Vec, w: _Vec, path: Array) -> Photons:
+    """Return photons of the weight one, without a history, that start from no surface."""
+    zero = jnp.zeros(path.shape, jnp.int32)
+    return Photons(
+        x=x,
+        w=w,
+        path=path,
+        weight=jnp.ones_like(path),
+        history=zero,
+        surface=zero - 1,
+        last_scattering=not_scattered(path),
+        alive=zero == 0,
+    )
+
+
+def _fly_once(
+    scene: DeviceScene, p: Photons, key: PRNGKeyArray, max_length: Float[Array, " photons"]
+) -> tuple[PhotonDraws, SurfaceEncounters, Flight]:
+    """Sample one flight of each photon, of at most `max_length`, m, with independent random numbers.
+
+    **Returns:** the numbers, for the collision; the surfaces ahead; and the flight.
+    """
+    # Not zero, whose logarithm would be an infinite optical depth.
+    tiny = jnp.finfo(p.weight.dtype).tiny
+    shape = (PhotonDraws.dimensions(scene.n_plates, return_path=False), p.weight.size)
+    uniform = jax.random.uniform(key, shape, p.weight.dtype, tiny)
+    draws = PhotonDraws.from_numbers(list(uniform), scene.n_plates)
+    encounters = meet_surfaces(scene, p, draws.plates_ahead)
+    flights = sample_flights(scene, p, encounters, max_length, draws.flight[None])
+    return draws, encounters, jax.tree.map(lambda a: a[0], flights)
+
+
 def _send_photons(scene: DeviceScene, count: int, key: PRNGKeyArray) -> Photons:
     """Send photons from the sensor, at independent positions across the beam."""
     radius_key, turn_key = jax.random.split(key)
     fraction, turn = jax.random.uniform(radius_key, (count,)), jax.random.uniform(turn_key, (count,))
     point, w, excess = scene.beam.ray(across_beam(scene.beam, fraction, turn))
     to_start = jnp.asarray(-scene.limits.start_distance, excess.dtype)
-    return start_photons(along(point, w, to_start), w, excess + to_start)
+    return _start_photons(along(point, w, to_start), w, excess + to_start)
 
 
 def _trace_flight(
@@ -212,7 +247,7 @@ def _trace_flight(
     4. Other photons collide and scatter.
     """
     beam, config = scene.beam, scene.config
-    draws, encounters, flight = fly_once(scene, p, key, scene.longest_flight(p))
+    draws, encounters, flight = _fly_once(scene, p, key, scene.longest_flight(p))
     weight, history = p.weight, p.history
     for passage in passed_plates(scene, p, flight, encounters):
         after = scene.history_after(history, config.surfaces[passage.plate].transmission)

@@ -299,7 +299,7 @@ def _polynomial_of_precision(x: _Reals, single: Sequence[float], double: Sequenc
 # derivatives into NaN.
 
 
-def small_argument(k: _Reals) -> tuple[Bool[Array, "..."], _Reals]:
+def _small_argument(k: _Reals) -> tuple[Bool[Array, "..."], _Reals]:
     """True where k < 1, and the argument of the expansion for small k: k within (0, 1), 1 elsewhere."""
     is_small = k < 1
     return is_small, jnp.where(is_small, jnp.maximum(k, jnp.finfo(k.dtype).tiny), 1.0)
@@ -308,11 +308,7 @@ def small_argument(k: _Reals) -> tuple[Bool[Array, "..."], _Reals]:
 def _large_argument(k: _Reals) -> tuple[_Reals, _Reals]:
     """Return k where it is at least 1, and 1 elsewhere; and the argument s of the polynomials Qn."""
     k = jnp.maximum(k, 1.0)
-    return k, 7.0 * _reciprocal(k) - 1.0
-
-
-def _reciprocal(large: _Reals) -> _Reals:
-    return 1.0 / (large + 2.5)
+    return k, 7.0 / (k + 2.5) - 1.0
 
 
 def _scale(k: _Reals) -> _Reals:
@@ -320,14 +316,9 @@ def _scale(k: _Reals) -> _Reals:
     return jnp.where(k < 1, 1.0, jnp.exp(-k))
 
 
-def scale_and_reciprocal(k: _Reals) -> tuple[_Reals, _Reals]:
-    """The factor between `tau` and `scaled_tau`, and the reciprocal 1/(k + 2.5) in the argument of the Qn."""
-    return _scale(k), _reciprocal(jnp.maximum(k, 1.0))
-
-
 def scaled_e1(k: _Reals) -> _Reals:
     """E1(k) for k < 1, and exp(k) E1(k) from there on."""
-    is_small, small = small_argument(k)
+    is_small, small = _small_argument(k)
     large, s = _large_argument(k)
     below = _polynomial_of_precision(small, _P1_SINGLE, _P1_DOUBLE) - jnp.log(small)
     above = _polynomial_of_precision(s, _Q1_SINGLE, _Q1_DOUBLE) / (large + 1.0)
@@ -336,7 +327,7 @@ def scaled_e1(k: _Reals) -> _Reals:
 
 def scaled_e2(k: _Reals) -> _Reals:
     """E2(k) for k < 1, and exp(k) E2(k) from there on."""
-    is_small, small = small_argument(k)
+    is_small, small = _small_argument(k)
     large, s = _large_argument(k)
     below = small * jnp.log(small) + _polynomial_of_precision(1.0 - small, _P2_SINGLE, _P2_DOUBLE)
     above = _polynomial_of_precision(s, _Q2_SINGLE, _Q2_DOUBLE) / (large + 2.0)
@@ -349,7 +340,7 @@ def _scaled_tau_above(large: _Reals, s: _Reals) -> _Reals:
 
 def scaled_tau(k: _Reals) -> _Reals:
     """2 E3(k) for k < 1, and exp(k) 2 E3(k) from there on."""
-    is_small, small = small_argument(k)
+    is_small, small = _small_argument(k)
     # In this order: the square of a small k would underflow before it meets the logarithm.
     log_term = small * (small * jnp.log(small))
     below = _polynomial_of_precision(0.75 - small, _PT_SINGLE, _PT_DOUBLE) - log_term
@@ -377,7 +368,7 @@ def tau(k: _Reals) -> _Reals:
 @jax.custom_jvp
 def omega(k: _Reals) -> _Reals:
     """1 - 2 E3(k), the absorptance that belongs to `tau`, without subtraction for small k."""
-    is_small, small = small_argument(k)
+    is_small, small = _small_argument(k)
     log_term = small * jnp.log(small)
     # The factor is k itself, not the clamped one: zero at k = 0.
     below = k * (log_term + _polynomial_of_precision(1.0 - small, _PO_SINGLE, _PO_DOUBLE))

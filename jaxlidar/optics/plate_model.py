@@ -29,11 +29,10 @@ Multiplied by V = v^M, with g = v/t and W = (1 - V^2)/(1 - v^2), so that V S = g
     R = Ra + Ta Rs t/(1 - Rs r),    T = Ta Ts/(1 - Rs r),    1 - R - T = Aa + Ta (As + Rs A)/(1 - Rs r).
 
 *Numerics.* Nothing here is a difference of close numbers, so that all three are accurate from transparent
-plates (A = 0: V = 1, W = M) to opaque ones. Single precision needs more: V = v^M magnifies the rounding of
-beta by M beta, which reaches 80. There v is corrected and beta carried with twice the digits
-(`jaxlidar.optics.double_single`). The derivatives are those of these expressions, put into the same form
-(`_slopes_k`, `_slopes_M`): the textbook's a, b and their square root are not differentiable at A = 0, while
-the result is.
+plates (A = 0: V = 1, W = M) to opaque ones. V = v^M alone magnifies rounding, that of beta by M beta, which
+reaches 80 before V underflows: single precision leaves five digits. The derivatives are those of these
+expressions, put into the same form (`_slopes_k`, `_slopes_M`): the textbook's a, b and their square root are
+not differentiable at A = 0, while the result is.
 """
 
 import math
@@ -48,8 +47,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float
 
 from jaxlidar._fields.checks import check_numbers
 from jaxlidar._jax.one_function import barrier
-from jaxlidar.optics import double_single, expint
-from jaxlidar.optics.double_single import DoubleSingle
+from jaxlidar.optics import expint
 from jaxlidar.optics.leaf_surface import LeafSurface
 
 _Reals = Float[Array, "..."]
@@ -65,10 +63,10 @@ def plate_model(k: Float[ArrayLike, "..."], N: Float[ArrayLike, "..."], surface:
     Measured relative errors, for k up to 100, N up to 10 and n from 1.2 to 1.55:
 
     - Double precision: 2e-14.
-    - Single precision: 7e-7 for the three, 1e-6 for the derivatives of transmittance and those in N, and
-      1.2e-6 for dR/dk, dA/dk and dR/dN, each at the worst of 400,000 random points (999 of 1,000 lie within
-      8e-7). Derivatives below 1e-30 lose digits on their way to zero. A surface of NumPy numbers enters with
-      all its digits. One of JAX arrays, which are rounded, costs up to 3e-7 more.
+    - Single precision: 1.2e-6 for reflectance, absorptance and dR/dk, 2.5e-6 for dA/dk, and 1e-5 for
+      transmittance and the other derivatives, each at the worst of 200,000 random points (999 of 1,000 lie
+      within 5e-6; leaves of k < 10 and N < 3.5 within 5e-6). Derivatives below 1e-30 lose digits on their way
+      to zero.
 
     **Arguments:**
 
@@ -113,44 +111,24 @@ def plate_model_slopes(
     return _slopes_of(*_arrays(k, N, surface))
 
 
-def _arrays(k: Any, N: Any, surface: LeafSurface) -> tuple[_Reals, _Reals, LeafSurface, DoubleSingle | None]:
-    """Arrays of one type, and in single precision kappa = (r12 + r21)/t21 in double-single."""
+def _arrays(k: Any, N: Any, surface: LeafSurface) -> tuple[_Reals, _Reals, LeafSurface]:
+    """Return arrays of one type and one shape."""
     for name, x in {"k": k, "N": N, **surface._asdict()}.items():
         check_numbers(name, x)
     dtype = jnp.result_type(k, N, float)
-    k, N, *face = (jnp.asarray(x, dtype) for x in (k, N, *surface))
-    face, kappa = LeafSurface(*face), None
-    if dtype == jnp.float32:
-        if any(isinstance(x, jax.Array) for x in surface):
-            numerator = double_single.add(double_single.split(face.r21), double_single.split(face.r12))
-            kappa = double_single.divide(numerator, double_single.split(face.t21), 1 / face.t21)
-        else:
-            # NumPy numbers have the digits of double precision: kappa is computed from these.
-            kappa = double_single.from_double((np.asarray(surface.r12, float) + surface.r21) / surface.t21)
-    return k, N, face, kappa
+    k, N, *face = jnp.broadcast_arrays(*(jnp.asarray(x, dtype) for x in (k, N, *surface)))
+    return k, N, LeafSurface(*face)
 
 
 # Compiled as one program: called outside of `jit`, every operation would be compiled by itself.
 @jax.jit
-def _values_of(k: _Reals, N: _Reals, face: LeafSurface, kappa: DoubleSingle | None) -> Triple:
-    k, N, face, kappa = _broadcast(k, N, face, kappa)
-    return _leaf(k, N - 1, face, kappa)
+def _values_of(k: _Reals, N: _Reals, face: LeafSurface) -> Triple:
+    return _leaf(k, N - 1, face)
 
 
 @jax.jit
-def _slopes_of(
-    k: _Reals, N: _Reals, face: LeafSurface, kappa: DoubleSingle | None
-) -> tuple[Triple, Triple, Triple]:
-    k, N, face, kappa = _broadcast(k, N, face, kappa)
-    return _values_and_slopes(k, N - 1, face, kappa)
-
-
-def _broadcast(
-    k: _Reals, N: _Reals, face: LeafSurface, kappa: DoubleSingle | None
-) -> tuple[_Reals, _Reals, LeafSurface, DoubleSingle | None]:
-    """Arrays of one shape."""
-    k, N, *columns = jnp.broadcast_arrays(k, N, *face, *(kappa or ()))
-    return k, N, LeafSurface(*columns[:6]), kappa and DoubleSingle(*columns[6:])
+def _slopes_of(k: _Reals, N: _Reals, face: LeafSurface) -> tuple[Triple, Triple, Triple]:
+    return _values_and_slopes(k, N - 1, face)
 
 
 class _PileState(NamedTuple):
@@ -177,7 +155,7 @@ class _PileState(NamedTuple):
     D: Array
 
 
-def _state(k: _Reals, M: _Reals, face: LeafSurface, kappa: DoubleSingle | None) -> _PileState:
+def _state(k: _Reals, M: _Reals, face: LeafSurface) -> _PileState:
     """Evaluate plate and pile: the equations of the module's docstring from top to bottom."""
     # The barriers keep the compiler from computing these again for every output (twice as fast on the CPU).
     tau, omega = barrier((expint.tau(k), expint.omega(k)))
@@ -195,27 +173,15 @@ def _state(k: _Reals, M: _Reals, face: LeafSurface, kappa: DoubleSingle | None) 
     reciprocal = 1 / (2 * t + y + root)
     g, w = 2 * reciprocal, (y + root) * reciprocal
     v = t * g
-    fine_beta = None
-    if kappa is not None:
-        # The corrected values replace those of single precision; derivatives are of the latter.
-        scaled_v = face.t12 * face.t21 * expint.scaled_tau(k) / (q * p) * g
-        (fine_w, fine_v), fine_beta = double_single.refine_decay(
-            *jax.lax.stop_gradient((k, w, scaled_v, kappa))
-        )
-        w = w + (fine_w - jax.lax.stop_gradient(w))
-        v = v + (fine_v - jax.lax.stop_gradient(v))
-    beta, V, Z = barrier(_decay(w, jax.lax.stop_gradient(v), M, fine_beta))
+    beta, V, Z = barrier(_decay(w, jax.lax.stop_gradient(v), M))
     W = jnp.where(is_clear, M, Z * (1 + V) / (jnp.where(is_clear, 1.0, w) * (1 + v)))
     D = s * g * W + 1 + V * V
     return _PileState(tau, t, r, A, Ta, Ra, Aa, q, p, y, s, g, v, w, beta, V, Z, W, D)
 
 
 @jax.custom_jvp
-def _decay(w: _Reals, v: _Reals, M: _Reals, fine_beta: DoubleSingle | None) -> Triple:
+def _decay(w: _Reals, v: _Reals, M: _Reals) -> Triple:
     """beta = -ln v, V = v^M and 1 - V, where v = 1 - w is given in both forms."""
-    if fine_beta is not None:
-        decay = double_single.exp_minus(double_single.multiply(double_single.split(M), fine_beta))
-        return double_single.to_single(fine_beta), *decay
     # The logarithm of the form that has more digits: of 1 - w for v near 1, else of v.
     is_thin = w < 0.3
     v = jnp.maximum(v, jnp.finfo(v.dtype).tiny)
@@ -226,8 +192,8 @@ def _decay(w: _Reals, v: _Reals, M: _Reals, fine_beta: DoubleSingle | None) -> T
 @_decay.defjvp
 def _decay_jvp(primals, tangents):
     # The derivative goes through w alone, for v = 1 - w.
-    _, v, M, _ = primals
-    dw, _, dM, _ = tangents
+    _, v, M = primals
+    dw, _, dM = tangents
     beta, V, Z = _decay(*primals)
     dbeta = dw / jnp.maximum(v, jnp.finfo(v.dtype).tiny)
     dV = -V * (beta * dM + M * dbeta)
@@ -236,25 +202,21 @@ def _decay_jvp(primals, tangents):
 
 @jax.custom_jvp
 @jax.jit
-def _leaf(k: _Reals, M: _Reals, face: LeafSurface, kappa: DoubleSingle | None) -> Triple:
-    return _values(_state(k, M, face, kappa))
+def _leaf(k: _Reals, M: _Reals, face: LeafSurface) -> Triple:
+    return _values(_state(k, M, face))
 
 
 @jax.jit
-def _values_and_slopes(
-    k: _Reals, M: _Reals, face: LeafSurface, kappa: DoubleSingle | None
-) -> tuple[Triple, Triple, Triple]:
+def _values_and_slopes(k: _Reals, M: _Reals, face: LeafSurface) -> tuple[Triple, Triple, Triple]:
     """Values, derivatives in k and derivatives in M."""
-    x = _state(k, M, face, kappa)
+    x = _state(k, M, face)
     return _values(x), _slopes_k(x, k, M, face), _slopes_M(x)
 
 
 @jax.jit
-def _surface_tangents(
-    k: _Reals, M: _Reals, face: LeafSurface, kappa: DoubleSingle | None, dface: LeafSurface
-) -> Triple:
+def _surface_tangents(k: _Reals, M: _Reals, face: LeafSurface, dface: LeafSurface) -> Triple:
     """Changes of reflectance, transmittance and absorptance with a change of the surface."""
-    return jax.jvp(lambda f: _values(_state(k, M, f, kappa)), (face,), (dface,))[1]
+    return jax.jvp(lambda f: _values(_state(k, M, f)), (face,), (dface,))[1]
 
 
 def _pile(x: _PileState) -> Triple:
@@ -274,16 +236,16 @@ def _values(x: _PileState) -> Triple:
 
 def _leaf_jvp(primals, tangents):
     # Symbolic zeros tell which derivatives are not asked for. Those in the surface then cost nothing.
-    k, M, face, kappa = primals
-    dk, dM, dface, _ = tangents
-    values, in_k, in_M = _values_and_slopes(k, M, face, kappa)
+    k, M, face = primals
+    dk, dM, dface = tangents
+    values, in_k, in_M = _values_and_slopes(k, M, face)
     total: list = [jnp.zeros_like(k)] * 3
     for slopes, change in ((in_k, dk), (in_M, dM)):
         if not isinstance(change, SymbolicZero):
             total = [a + b * change for a, b in zip(total, slopes)]
     if not all(isinstance(d, SymbolicZero) for d in dface):
         dface = LeafSurface(*(jnp.zeros_like(k) if isinstance(d, SymbolicZero) else d for d in dface))
-        total = [a + b for a, b in zip(total, _surface_tangents(k, M, face, kappa, dface))]
+        total = [a + b for a, b in zip(total, _surface_tangents(k, M, face, dface))]
     return values, tuple(total)
 
 

@@ -332,7 +332,6 @@ def material(leaf: Prospect, wavelengths: Any) -> tuple[Array, LeafSurface]:
     x = as_numpy(wavelengths, "wavelengths")
     check_range("wavelengths", x, table.wavelength[0], table.wavelength[-1])
     absorption, face = _tabulated(table, x.tobytes(), x.shape, leaf.alpha)
-    # The surface stays in double precision: the plate model uses its digits in single precision too.
     return jnp.asarray(absorption, dtype), face
 
 

@@ -19,7 +19,7 @@ import dataclasses
 import enum
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any, NamedTuple, Protocol, TypeVar, runtime_checkable
 
 import jax
@@ -27,6 +27,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxlidar.sampling.errors import floating, namespace_of, student_widening
+from jaxlidar.sampling.moments import RunningMoments
 
 Estimate = TypeVar("Estimate")
 
@@ -151,6 +152,34 @@ class AbstractEstimate(abc.ABC):
     @abc.abstractmethod
     def errors(self) -> HasErrors:
         """Return the errors of the estimate so far."""
+
+
+class MeanEstimate(AbstractEstimate):
+    """The mean of a tree of arrays over batches, with its standard errors.
+
+    - `moments`: of the batches so far; None before the first.
+    """
+
+    def __init__(self, trace: Callable[[range], Iterable[Any]]):
+        """`trace`: traces the batches with the given numbers."""
+        self.trace = trace
+        self.moments: Any = None
+
+    @property
+    def n_batches(self) -> int:
+        """Number of batches."""
+        return 0 if self.moments is None else self.moments.count
+
+    def add_batches(self, numbers: range) -> None:
+        """Trace batches and add them."""
+        for batch in self.trace(numbers):
+            moments = RunningMoments.on_host(batch) if self.moments is None else self.moments
+            self.moments = moments.update(batch)
+
+    def errors(self) -> EstimateErrors:
+        """Return the largest standard error, of quantities whose scale is one."""
+        stderr = jax.tree.leaves(self.moments.stderr)
+        return EstimateErrors(max(float(np.max(a, initial=0.0)) for a in stderr))
 
 
 def sample_until(

@@ -2,8 +2,7 @@
 
 import dataclasses
 import time
-from collections.abc import Callable, Iterable, Sequence
-from typing import Any, final
+from typing import final
 
 import equinox as eqx
 import jax
@@ -11,9 +10,17 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from jaxlidar._fields.checks import check_choice, check_integer, check_key, check_range, concrete_number
+from jaxlidar._fields.checks import (
+    check_choice,
+    check_integer,
+    check_key,
+    check_range,
+    concrete_array,
+    concrete_number,
+)
 from jaxlidar._jax.programs import Program
 from jaxlidar._jax.threads import side_by_side
+from jaxlidar.planning.memory import MAX_APPLIED_WAVELENGTHS
 from jaxlidar.planning.path_lengths import PathLengths
 from jaxlidar.planning.plan import MIN_BATCHES
 from jaxlidar.planning.plan import plan as make_plan
@@ -22,23 +29,18 @@ from jaxlidar.planning.size_buckets import size_bucket
 from jaxlidar.progress import Progress, ProgressOption, shows_progress
 from jaxlidar.sampling.adaptive import (
     BATCH_STEPS,
-    AbstractEstimate,
-    EstimateErrors,
     HasErrors,
+    MeanEstimate,
     StoppingRule,
     sample_until,
 )
-from jaxlidar.sampling.moments import RunningMoments
 from jaxlidar.scenes.scene import Scene, check_kinds
 from jaxlidar.sensors.lidar import Lidar
-from jaxlidar.spectral.apply_optics import budget_excess, refuse_excess, setup_optics
+from jaxlidar.simulation.reflectance import distance_above, parallel_lidar
+from jaxlidar.spectral.apply_optics import budget_excess, refuse_excess
 from jaxlidar.trace.device_scene import DeviceScene, build_device_scene
-from jaxlidar.trace.photons.absorption import (
-    EnergyFractions,
-    from_beam,
-    from_parallel_light,
-    trace_to_end,
-)
+from jaxlidar.trace.first.footprint import bistatic_beam
+from jaxlidar.trace.photons.absorption import trace_to_end
 
 PHOTONS_PER_BATCH = 8192
 # A flight through a canopy with periodic sides is followed over at most this many heights of the canopy.
@@ -138,18 +140,28 @@ def energy_budget(
         raise ValueError("illumination = 'parallel'; that is admissible where the canopy has periodic sides")
     # Light is followed to its end: it may meet meshes that no ray of order one meets.
     effects = {"meshes": True} if scene.meshes else None
+    canopy, size = scene.canopy if illumination == "parallel" else None, np.zeros(2)
+    if canopy is not None:
+        size = concrete_array(canopy.voxels.voxel_size)[:2] * canopy.voxels.shape[:2]
+        centre = concrete_array(canopy.voxels.origin)[:2] + 0.5 * size
+        lidar = parallel_lidar(lidar.wavelength, lidar.zenith, lidar.azimuth, centre)
     plan = make_plan(lidar, scene, max_orders=1, effects=effects, describe=False)
-    setup = _with_longest_flights(make_setup(lidar, scene, plan))
+    if canopy is not None:
+        plan = plan.with_limits(start_distance=distance_above(lidar, scene, size))
+    setup = _without_record(make_setup(lidar, scene, plan))
     start_time = time.perf_counter()
     # Built here: a program that took the setup would be compiled for every number of voxels.
-    device_scene, optics = build_device_scene(setup, derivatives="none"), setup_optics(setup)
+    device_scene = build_device_scene(setup, derivatives="none")
+    if canopy is not None:
+        # The aim point, the middle of the period, is the origin.
+        beam = bistatic_beam(setup.lidar, None, jnp.asarray(-0.5 * size, float), jnp.asarray(size, float))
+        device_scene = dataclasses.replace(device_scene, beam=beam)
 
-    def trace_batch(number: int) -> EnergyFractions:
-        batch_key = jax.random.fold_in(key, number)
-        return _compiled_trace(device_scene, optics, batch_key, illumination == "parallel", max_orders)
+    def trace_batch(number: int) -> dict[str, Array]:
+        return _compiled_trace(device_scene, jax.random.fold_in(key, number), max_orders)
 
     with side_by_side() as run:
-        estimate = _BudgetEstimate(lambda numbers: run(trace_batch, numbers))
+        estimate = MeanEstimate(lambda numbers: run(trace_batch, numbers))
 
         def report(errors: HasErrors) -> None:
             if callable(progress):
@@ -166,15 +178,12 @@ def energy_budget(
         "error": errors.relative,
         "stopped": reason.value,
     }
-    names = setup.plan.config.materials
-    mean, stderr = (
-        _by_name(fractions, names) for fractions in (estimate.moments.mean, estimate.moments.stderr)
-    )
+    mean, stderr = (jax.tree.map(jnp.asarray, a) for a in (estimate.moments.mean, estimate.moments.stderr))
     # Light that arrives at the ground is absorbed there or goes on: it is no further fate.
     budget, errors_of_budget = ({k: v for k, v in a.items() if k != "transmitted"} for a in (mean, stderr))
     refuse_excess(np.asarray(budget_excess(budget, errors_of_budget)))
     return EnergyBudget(
-        absorbed={name: mean[name] for name in names},
+        absorbed={name: mean[name] for name in plan.config.materials},
         returned=mean["returned"],
         transmitted=mean["transmitted"],
         below=mean["below"],
@@ -185,80 +194,44 @@ def energy_budget(
     )
 
 
-class _BudgetEstimate(AbstractEstimate):
-    """Moments of the energy fractions of batches of photons.
-
-    `trace`: traces the batches with the given numbers.
-    """
-
-    def __init__(self, trace: Callable[[range], Iterable[EnergyFractions]]):
-        self.trace = trace
-        self.moments: Any = None
-
-    @property
-    def n_batches(self) -> int:
-        """Number of batches."""
-        return 0 if self.moments is None else self.moments.count
-
-    def add_batches(self, numbers: range) -> None:
-        """Trace batches and add them."""
-        for fractions in self.trace(numbers):
-            moments = RunningMoments.on_host(fractions) if self.moments is None else self.moments
-            self.moments = moments.update(fractions)
-
-    def errors(self) -> EstimateErrors:
-        """Return the largest standard error: it is relative to the emitted energy, which is one."""
-        stderr = jax.tree.leaves(self.moments.stderr)
-        return EstimateErrors(max(float(np.max(a, initial=0.0)) for a in stderr))
-
-
-def _by_name(fractions: Any, materials: Sequence[str]) -> dict[str, Float[Array, "wavelengths"]]:
-    """Return energy fractions, or their standard errors, by name."""
-    rows = dict(zip(materials, fractions.absorbed))
-    rows |= {"returned": fractions.up, "below": fractions.down}
-    rows |= {"transmitted": fractions.on_ground, "unfollowed": fractions.unfollowed}
-    return {name: jnp.asarray(row) for name, row in rows.items()}
-
-
-def _with_longest_flights(setup: Setup) -> Setup:
-    """Follow flights as far as they may go, whatever the record's window is."""
+def _without_record(setup: Setup) -> Setup:
+    """Apply optics to light while it is traced, and follow it as far as it may go, whatever the window is."""
     canopy, plan = setup.scene.canopy, setup.plan
-    if canopy is None or canopy.sides == "open":
-        return setup
-    lengths = PathLengths(setup.lidar, setup.scene)
-    height = concrete_number(canopy.voxels.voxel_size[2]) * canopy.voxels.shape[2]
-    max_flight = min(MAX_FLIGHT_HEIGHTS * height, lengths.longest_affordable_flight)
-    plan = plan.with_limits(max_flight=max_flight).with_config(
-        max_faces=size_bucket(lengths.voxels_along(max_flight))
+    # A square of it still has its place in single precision.
+    plan = plan.with_limits(max_path=1e15).with_config(
+        keeps_histories=False,
+        degree=0,
+        order_steps=2,
+        deposits_per_flight=1,
+        photons_per_batch=PHOTONS_PER_BATCH,
     )
+    if canopy is not None and canopy.sides == "periodic":
+        lengths = PathLengths(setup.lidar, setup.scene)
+        height = concrete_number(canopy.voxels.voxel_size[2]) * canopy.voxels.shape[2]
+        max_flight = min(MAX_FLIGHT_HEIGHTS * height, lengths.longest_affordable_flight)
+        max_faces = size_bucket(lengths.voxels_along(max_flight))
+        plan = plan.with_limits(max_flight=max_flight).with_config(max_faces=max_faces)
     return dataclasses.replace(setup, plan=plan)
 
 
-def _trace(
-    scene: DeviceScene,
-    optics: Float[Array, "channels wavelengths"],
-    key: PRNGKeyArray,
-    parallel: bool,
-    max_orders: int,
-) -> EnergyFractions:
-    """Trace one batch; where leaves transmit straight on, once for each wavelength."""
-    source = from_parallel_light if parallel else from_beam
-    if scene.straight_transmittance is None:
-        return trace_to_end(scene, optics, key, PHOTONS_PER_BATCH, source, max_orders)
+def _trace(scene: DeviceScene, key: PRNGKeyArray, max_orders: int) -> dict[str, Array]:
+    """Trace one batch.
 
-    def trace_wavelength(of_wavelength: tuple[Array, Array]) -> EnergyFractions:
-        transmittance, optics = of_wavelength
-        wavelength_scene = scene.with_leaf_transmittance(transmittance)
-        return trace_to_end(wavelength_scene, optics[:, None], key, PHOTONS_PER_BATCH, source, max_orders)
+    It is traced once for every few wavelengths; where leaves transmit straight on, for each.
+    """
+    optics, transmittance = scene.optics, scene.straight_transmittance
+    assert optics is not None
+    n_wavelengths = optics.shape[1]
+    size = min(n_wavelengths, MAX_APPLIED_WAVELENGTHS if transmittance is None else 1)
 
-    spectra = jax.lax.map(trace_wavelength, (scene.straight_transmittance, optics.T))
-    return EnergyFractions(
-        absorbed=jnp.moveaxis(spectra.absorbed[..., 0], 0, 1),
-        up=spectra.up[:, 0],
-        down=spectra.down[:, 0],
-        on_ground=spectra.on_ground[:, 0],
-        unfollowed=spectra.unfollowed[:, 0],
-    )
+    def trace_wavelengths(numbers: Array) -> dict[str, Array]:
+        few = scene if transmittance is None else scene.with_leaf_transmittance(transmittance[numbers[0]])
+        return trace_to_end(dataclasses.replace(few, optics=optics[:, numbers]), key, max_orders)
+
+    # The last group is filled up with copies of the last wavelength.
+    numbers = jnp.minimum(jnp.arange(-(-n_wavelengths // size) * size), n_wavelengths - 1)
+    groups = jax.lax.map(trace_wavelengths, numbers.reshape(-1, size))
+    return jax.tree.map(lambda a: a.reshape(-1)[:n_wavelengths], groups)
 
 
 _compiled_trace = Program(_trace, one_core=True)

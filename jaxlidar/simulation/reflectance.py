@@ -25,6 +25,7 @@ order in the exact direction of the sun, and exp(-tau_in - tau_out) in every oth
 
 import dataclasses
 import functools
+import math
 from collections.abc import Sequence
 from typing import Any, final
 
@@ -57,7 +58,8 @@ from jaxlidar.planning.plan import plan as make_plan
 from jaxlidar.planning.plan_check import check_plan
 from jaxlidar.planning.setup import make_setup
 from jaxlidar.planning.size_buckets import size_bucket
-from jaxlidar.sampling.errors import student_widening
+from jaxlidar.sampling.adaptive import MeanEstimate
+from jaxlidar.sampling.moments import RunningMoments
 from jaxlidar.scenes.scene import Scene
 from jaxlidar.scenes.terrain import Terrain
 from jaxlidar.sensors.lidar import Lidar
@@ -223,18 +225,19 @@ def reflectance_factor(
             ]
             return jax.lax.cond(is_hot_spot, *traces)
 
-        batches, unfollowed = jax.lax.map(trace_batch, keys)
+        moments = RunningMoments.of_batches(jax.lax.map(trace_batch, keys))
     else:
         run_batch = _compiled_batch.bind(**common)
         with side_by_side() as run:
-            results = list(run(lambda batch_key: run_batch(key=batch_key), keys))
-        batches, unfollowed = (jnp.stack(arrays) for arrays in zip(*results))
-    # Standard errors have no derivatives: they would be those of the noise.
-    variance = jnp.var(jax.lax.stop_gradient(batches), axis=0) / (MIN_BATCHES - 1)
+            estimate = MeanEstimate(lambda numbers: run(lambda n: run_batch(key=keys[n]), numbers))
+            estimate.add_batches(range(MIN_BATCHES))
+        moments = estimate.moments
+    reflectance, unfollowed = map(jnp.asarray, moments.mean)
     return ReflectanceFactor(
-        reflectance=jnp.mean(batches, axis=0) * setup.nan_unless_covered(),
-        stderr=student_widening(MIN_BATCHES) * jnp.sqrt(variance),
-        unfollowed=jnp.mean(unfollowed, axis=0),
+        reflectance=reflectance * setup.nan_unless_covered(),
+        # Standard errors have no derivatives: they would be those of the noise.
+        stderr=jnp.asarray(moments._replace(squares=jax.lax.stop_gradient(moments.squares)).stderr[0]),
+        unfollowed=unfollowed,
     )
 
 
@@ -319,17 +322,30 @@ def _is_same_direction(sun: tuple[Any, Any], view: tuple[Any, Any]) -> Any:
 
 
 def _sensor(view: tuple[Any, Any], wavelengths: Any, centre: np.ndarray) -> Lidar:
-    """Return a lidar in the place of the sensor: its pulse and sampling collect all light in a few bins."""
+    """Return a lidar in the place of the sensor."""
     # Light travels from the sensor, against the direction in which that stands.
+    return parallel_lidar(wavelengths, view[0], view[1] + 180.0, centre)
+
+
+def parallel_lidar(wavelengths: Any, zenith: Any, azimuth: Any, centre: Any) -> Lidar:
+    """Return a lidar for plans of parallel light: its pulse and sampling collect all light in a few bins."""
     return Lidar(
         wavelength=wavelengths,
         altitude=_ALTITUDE,
-        zenith=view[0],
-        azimuth=view[1] + 180.0,
+        zenith=zenith,
+        azimuth=azimuth,
         divergence=0.0,
         position=centre,
         sampling_interval=_LONGEST_PATH_TIME,
     )
+
+
+def distance_above(lidar: Lidar, scene: Scene, size: np.ndarray) -> float:
+    """Return the distance before the reference plane, m, at which parallel light starts above a rectangle."""
+    # A footprint whose rim, as plans see it, encloses the rectangle; straight down, heights alone count.
+    divergence = 0.5e3 * float(np.linalg.norm(size)) / _ALTITUDE
+    vertical = dataclasses.replace(lidar, zenith=0.0, divergence=divergence)
+    return PathLengths(vertical, scene).start_distance / math.cos(math.radians(concrete_number(lidar.zenith)))
 
 
 def _area_in_view(scene: Scene, area: Any) -> tuple[np.ndarray, np.ndarray]:
@@ -399,10 +415,6 @@ def _make_plan(
     is_vertical = sun_zenith is not None and float(sun_zenith) == 0.0
     # A sun that is being traced may stand anywhere.
     sun_cosine = np.cos(np.deg2rad(_MAX_ZENITH if sun_zenith is None else float(sun_zenith)))
-    cosine = np.cos(np.deg2rad(concrete_number(lidar.zenith)))
-    # Planes rise from the centre of the area to its corners, and terrain by its relief.
-    rise = _steepest_slope(scene) * float(np.sum(0.5 * extent)) + _relief(scene)
-    start_distance = plan.limits.start_distance + rise / cosine
     max_faces = plan.config.max_faces
     if scene.canopy is not None:
         lengths = PathLengths(lidar, scene)
@@ -410,24 +422,8 @@ def _make_plan(
         max_faces = max(max_faces, size_bucket(lengths.voxels_along(height / sun_cosine)))
     # Light that is not followed is in the result, whatever the albedo.
     plan = dataclasses.replace(plan, scope=dataclasses.replace(plan.scope, albedo=1.0))
-    return plan.with_limits(start_distance=float(start_distance)).with_config(
-        vertical=is_vertical, max_faces=max_faces
-    )
-
-
-def _steepest_slope(scene: Scene) -> float:
-    """Return the largest slope of all planes of the scene, as a tangent."""
-    slopes = [getattr(surface, "slope", None) for surface in scene.surfaces]
-    tangents = [abs(np.tan(np.deg2rad(concrete_number(slope)))) for slope in slopes if slope is not None]
-    return float(max(tangents, default=0.0))
-
-
-def _relief(scene: Scene) -> float:
-    """Return the height of the terrain's relief, m."""
-    if not isinstance(scene.ground, Terrain):
-        return 0.0
-    heights = concrete_array(scene.ground.heights)
-    return float(heights.max() - heights.min())
+    plan = plan.with_limits(start_distance=distance_above(lidar, scene, extent))
+    return plan.with_config(vertical=is_vertical, max_faces=max_faces)
 
 
 def _trace_batch(
@@ -463,8 +459,8 @@ def _trace_batch(
     returned = of_wavelengths(jnp.sum(higher.weights, axis=-1) + higher.outside, scene.histories)
     if is_hot_spot:
         # The first order knows its own path back.
-        first = trace_first(scene, key)
-        returned += of_wavelengths(jnp.sum(first.weights, axis=-1) + first.outside, scene.first_histories)
+        weights, outside = trace_first(scene, key)
+        returned += of_wavelengths(jnp.sum(weights, axis=-1) + outside, scene.first_histories)
     unfollowed = of_wavelengths(higher.flown_outside + higher.unfollowed, scene.histories)
     return returned / sun[2], unfollowed
 

@@ -223,25 +223,14 @@ class GroupLight(NamedTuple):
     aim: Float[Array, "2"]
 
 
-class BatchSums(NamedTuple):
-    """Results of one batch, by node or by shot.
-
-    - `waveform`: (nodes, wavelengths, samples), all materials together. - `energy`: sums of
-      `jaxlidar.spectral.apply_optics.ResponseSums`, by name. - `response`: their responses.
-    """
-
-    waveform: Any
-    energy: Any
-    response: Response
-
-
 class GroupContribution(NamedTuple):
     """Contribution of a group to its shots.
 
-    - `shots`: their numbers. - `lines`: components: samples by material,
-      then those of the first order, then the relative energy.
-    - `energy`: as in `BatchSums`. - `variance`, `energy_variance`: squared standard errors of the waveform
-      and of the energy. - `photons`: number of photons that contribute.
+    - `shots`: their numbers. - `lines`: components: samples by material, then those of the first order, then
+      the relative energy.
+    - `energy`: sums of `jaxlidar.spectral.apply_optics.ResponseSums`, by name.
+    - `variance`, `energy_variance`: squared standard errors of the waveform and of the energy.
+    - `photons`: number of photons that contribute.
     """
 
     shots: Int[np.ndarray, " shots"]
@@ -252,8 +241,14 @@ class GroupContribution(NamedTuple):
     photons: Int[np.ndarray, " shots"]
 
 
-def _trace_batch(scene: DeviceScene, nodes: EntryNodes, model: WaveformModel, key: PRNGKeyArray) -> BatchSums:
-    """Trace one batch."""
+def _trace_batch(
+    scene: DeviceScene, nodes: EntryNodes, model: WaveformModel, key: PRNGKeyArray
+) -> tuple[tuple[Array, dict[str, Array]], Response]:
+    """Trace one batch.
+
+    **Returns:** by node or by shot, the waveform of all materials together and the energy (see
+    `GroupContribution`), whose standard errors are needed; and the response.
+    """
 
     def sums(response: Response) -> tuple[Array, dict[str, Array]]:
         all_orders = response
@@ -267,7 +262,7 @@ def _trace_batch(scene: DeviceScene, nodes: EntryNodes, model: WaveformModel, ke
         response = trace_nodes(scene, nodes, key)
     else:
         response = trace_shots(scene, model.lidar, nodes, key)
-    return BatchSums(*jax.vmap(sums)(response), response)
+    return jax.vmap(sums)(response), response
 
 
 def _stacked_components(
@@ -294,15 +289,13 @@ def _group_moments(
     scene = _group_scene(scene, model, light)
 
     # A batch has the same random numbers in whichever round it is traced.
-    def trace_batch(number: Array) -> BatchSums:
+    def trace_batch(number: Array) -> tuple[tuple[Array, dict[str, Array]], Response]:
         return _trace_batch(scene, light.nodes, model, jax.random.fold_in(key, first + number))
 
     def add_batch(number: Array, moments: RunningMoments) -> RunningMoments:
-        batch = trace_batch(number)
-        return moments.update((batch.waveform, batch.energy), batch.response)
+        return moments.update(*trace_batch(number))
 
-    shapes: BatchSums = jax.eval_shape(trace_batch, first)
-    empty = RunningMoments.in_program((shapes.waveform, shapes.energy), shapes.response)
+    empty = RunningMoments.in_program(*jax.eval_shape(trace_batch, first))
     moments = jax.lax.fori_loop(0, count, add_batch, empty)
     # Waveforms by material are linear in the response: those of its mean are their mean, made once.
     components = jax.vmap(lambda response: _stacked_components(response, model))(moments.mean_only)
@@ -330,7 +323,7 @@ def _first_order_samples(
     assert light.shot_views is not None
     # The last shot is a dummy.
     shots = jnp.arange(light.shot_views.n_shots - 1)
-    weights = trace_first_of_shots(scene, model.lidar, shots, key).weights
+    weights, _ = trace_first_of_shots(scene, model.lidar, shots, key)
     return jax.vmap(lambda w: response_samples(jnp.sum(w, axis=1), model.first_histories, model))(weights)
 
 

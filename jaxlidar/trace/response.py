@@ -39,9 +39,15 @@ from jaxlidar.trace.photons.higher_orders import (
     trace_higher_orders,
     trace_photons,
 )
+from jaxlidar.trace.photons.histories import Histories
 from jaxlidar.trace.photons.random_numbers import random_words, to_unit
 
 Traced = TypeVar("Traced")
+Weights = TypeVar("Weights")
+# Order one of a response that has more: its `first` and `first_outside`.
+FirstOrderWeights = tuple[
+    Float[Array, "traces materials first_histories bins"], Float[Array, "traces materials first_histories"]
+]
 
 
 @final
@@ -150,9 +156,8 @@ def trace_with_scores(
     higher = trace_higher_orders(scene, key)
     assert higher.weight_slopes is not None
     derivatives = derivatives + higher.weight_slopes
-    response = jax.tree.map(lambda a: a[None], dataclasses.replace(higher, weight_slopes=None))
-    first_response = FirstOrderResponse(weights[None], first.outside[None])
-    return join_orders(first_response, response), jnp.moveaxis(derivatives, 0, 2)
+    parts = (weights, first.outside), dataclasses.replace(higher, weight_slopes=None)
+    return join_orders(*jax.tree.map(lambda a: a[None], parts)), jnp.moveaxis(derivatives, 0, 2)
 
 
 def trace_first_only(scene: DeviceScene, key: PRNGKeyArray, ray_slice: RaySlice = ALL_RAYS) -> Response:
@@ -160,52 +165,40 @@ def trace_first_only(scene: DeviceScene, key: PRNGKeyArray, ray_slice: RaySlice 
 
     def trace(scene: DeviceScene) -> Response:
         response = first_order_response(scene, *_first(scene, key, ray_slice))
-        return response if scene.optics is None else apply_optics_to_first(response, scene)
+        if scene.optics is None:
+            return response
+        without_traces = jax.tree.map(lambda a: a[0], response)
+        return histories_to_traces(without_traces, scene.first_histories, scene.optics)
 
     return _for_each_trace(trace, scene)
 
 
-def apply_optics_to_first(response: Response, scene: DeviceScene) -> Response:
-    """Apply optics to a response of one trace and of order one alone: wavelengths become traces."""
-    assert scene.optics is not None
-    monomials = scene.first_histories.monomials(scene.optics)
+def histories_to_traces(
+    weights: Weights, histories: Histories, optics: Float[Array, "channels wavelengths"]
+) -> Weights:
+    """Sum over histories with their optics: wavelengths become traces, with one history each.
 
-    def apply(a: Array, history_axis: int) -> Array:
-        by_wavelength = tensordot(monomials, a[0], axes=(0, history_axis))
-        return jnp.expand_dims(by_wavelength, 1 + history_axis)
+    `weights`: tree of arrays. Histories are the first axis of those with a single axis, else the second,
+    after materials.
+    """
+    monomials = histories.monomials(optics)
 
-    return Response(
-        first=apply(response.first, 1),
-        higher=None,
-        first_outside=apply(response.first_outside, 1),
-        higher_outside=None,
-        arrived=apply(response.arrived, 1),
-        departed=apply(response.departed, 1),
-        escaped=apply(response.escaped, 0),
-        flown_outside=apply(response.flown_outside, 0),
-        unfollowed=apply(response.unfollowed, 0),
-    )
+    def apply(a: Array) -> Array:
+        axis = min(a.ndim - 1, 1)
+        return jnp.expand_dims(tensordot(monomials, a, axes=(0, axis)), 1 + axis)
 
-
-class FirstOrderResponse(eqx.Module):
-    """Order one of a response that has more: `first` and `first_outside` of `Response`."""
-
-    weights: Float[Array, "traces materials first_histories bins"]
-    outside: Float[Array, "traces materials first_histories"]
+    return jax.tree.map(apply, weights)
 
 
 # First and higher orders share nothing, so that they can be compiled side by side.
-def trace_first(scene: DeviceScene, key: PRNGKeyArray) -> FirstOrderResponse:
-    """Trace order one of a batch."""
+def trace_first(scene: DeviceScene, key: PRNGKeyArray) -> FirstOrderWeights:
+    """Trace order one of a batch; traces lie along the first axis."""
 
-    def trace(scene: DeviceScene) -> FirstOrderResponse:
+    def trace(scene: DeviceScene) -> FirstOrderWeights:
         first, weights = _first(scene, key)
         if scene.optics is None:
-            return FirstOrderResponse(weights[None], first.outside[None])
-        # With optics applied there is one trace per wavelength, with one history.
-        monomials = scene.first_histories.monomials(scene.optics)
-        by_wavelength = (einsum("hw,mh...->wm...", monomials, a) for a in (weights, first.outside))
-        return FirstOrderResponse(*(jnp.expand_dims(a, 2) for a in by_wavelength))
+            return weights[None], first.outside[None]
+        return histories_to_traces((weights, first.outside), scene.first_histories, scene.optics)
 
     return _for_each_trace(trace, scene)
 
@@ -221,24 +214,28 @@ def trace_higher(scene: DeviceScene, key: PRNGKeyArray) -> HigherOrderTally:
         )
         if scene.optics is None:
             return jax.tree.map(lambda a: a[None], tally)
-        # Wavelengths, in place of histories, become traces with one history each.
-        # Their axis is the first of arrays with a single axis, else the second, after materials.
-        return jax.tree.map(lambda a: _axis_to_traces(a, min(a.ndim - 1, 1)), tally)
+        return wavelengths_to_traces(tally)
 
     return _for_each_trace(trace, scene)
 
 
-def _axis_to_traces(a: Array, wavelength_axis: int) -> Array:
-    """Move the axis of wavelengths to the front, and put one history in its place."""
-    return jnp.expand_dims(jnp.moveaxis(a, wavelength_axis, 0), wavelength_axis + 1)
+def wavelengths_to_traces(tally: HigherOrderTally) -> HigherOrderTally:
+    """Make traces of the wavelengths that a tally has in place of histories, with one history each."""
+
+    def move(a: Array) -> Array:
+        axis = min(a.ndim - 1, 1)
+        return jnp.expand_dims(jnp.moveaxis(a, axis, 0), axis + 1)
+
+    return jax.tree.map(move, tally)
 
 
-def join_orders(first: FirstOrderResponse, higher: HigherOrderTally) -> Response:
+def join_orders(first: FirstOrderWeights, higher: HigherOrderTally) -> Response:
     """Make the response of all orders."""
+    weights, outside = first
     return Response(
-        first=first.weights,
+        first=weights,
         higher=higher.weights,
-        first_outside=first.outside,
+        first_outside=outside,
         higher_outside=higher.outside,
         arrived=higher.arrived,
         departed=higher.departed,

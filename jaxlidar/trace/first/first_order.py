@@ -223,16 +223,6 @@ class FirstOrderTally(NamedTuple):
         return self.returned, self.arrived, self.slopes
 
 
-class ChunkTally(NamedTuple):
-    """Sums over a chunk of rays: returns by row and padded bin, energies, and derivatives of returns."""
-
-    returned: Float[Array, "entries padded"]
-    arrived: Float[Array, "materials histories"]
-    scattered: Float[Array, "materials histories"]
-    escaped: Float[Array, "histories"]
-    slopes: Float[Array, "materials histories bins parameters"] | None
-
-
 class MaterialReturn(NamedTuple):
     """What a material returns of segments: its extinction, 1/m, times a factor, times the pieces of these.
 
@@ -287,7 +277,7 @@ class FirstOrderTracer:
         """Number of materials of the medium, leaf and bark, which are the first ones."""
         return sum(scatterer is not None for scatterer in (self.scene.config.leaf, self.scene.config.bark))
 
-    def trace_chunk(self, across: tuple[Scalar, Scalar], energy: Scalar) -> ChunkTally:
+    def trace_chunk(self, across: tuple[Scalar, Scalar], energy: Scalar) -> FirstOrder:
         """Trace a chunk of rays, and sum what they return."""
         scene = self.scene
         tally = self.trace_rays(send_rays(scene, across, energy))
@@ -295,8 +285,9 @@ class FirstOrderTracer:
             bins = scene.bins
             inside = tally.slopes[:, bins.max_span : bins.max_span + bins.count]
             tally = tally._replace(slopes=inside.reshape(*self.shape, bins.count, -1))
+        weights, outside = scene.bins.trim(tally.returned.reshape(*self.shape, -1))
         arrived, scattered = tally.arrived.reshape(self.shape), tally.scattered.reshape(self.shape)
-        return ChunkTally(tally.returned, arrived, scattered, tally.escaped, tally.slopes)
+        return FirstOrder(weights, outside, arrived, scattered, tally.escaped, tally.slopes)
 
     def trace_rays(self, rays: FootprintRays) -> FirstOrderTally:
         """Trace rays that have been sent, by the steps of `first_order`."""
@@ -544,9 +535,9 @@ def first_order(
     4. What is left of rays that meet no ground escapes.
     5. Smooth what segments return over bins: smoothing is linear, so that only the sum is smoothed.
     """
-    tracer, bins = FirstOrderTracer(scene, mirror), scene.bins
+    tracer = FirstOrderTracer(scene, mirror)
 
-    def trace_chunk(x: Scalar, y: Scalar, energy: Scalar) -> ChunkTally:
+    def trace_chunk(x: Scalar, y: Scalar, energy: Scalar) -> FirstOrder:
         return tracer.trace_chunk((x, y), energy)
 
     # Reverse mode traces each chunk again, and keeps the intermediate values of one chunk at a time.
@@ -554,15 +545,12 @@ def first_order(
     across, energy = move_rays(scene, across, energy)
     n_rays = energy.shape[0]
     if n_rays <= RAYS_AT_ONCE:
-        total = chunk(*across, energy)
-    elif scene.medium is None and scene.meshes is None:
+        return chunk(*across, energy)
+    if scene.medium is None and scene.meshes is None:
         # Without a march all chunks fit into the memory at once, and no loop is compiled.
         chunks = jax.vmap(chunk)(*ray_chunks(across, energy))
-        total = jax.tree.map(lambda a: jnp.sum(a, axis=0), chunks)
-    else:
-        total = sum_over_chunks(scene, chunk, ray_chunks(across, energy))
-    weights, outside = bins.trim(total.returned.reshape(*tracer.shape, bins.padded))
-    return FirstOrder(weights, outside, total.arrived, total.scattered, total.escaped, total.slopes)
+        return jax.tree.map(lambda a: jnp.sum(a, axis=0), chunks)
+    return sum_over_chunks(scene, chunk, ray_chunks(across, energy))
 
 
 def ray_chunks(across: tuple[Scalar, Scalar], energy: Scalar) -> list[Float[Array, "chunks rays"]]:

@@ -17,12 +17,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from jaxlidar._jax.products import einsum
 from jaxlidar._vectors import vec
 from jaxlidar.trace.device_scene import DeviceScene
 from jaxlidar.trace.first.first_order import FirstOrderTally, FirstOrderTracer, send_rays
 from jaxlidar.trace.first.footprint import Beam, RaySlice, fibonacci_disc
-from jaxlidar.trace.response import Response, fates_after_first_scattering
+from jaxlidar.trace.response import Response, fates_after_first_scattering, histories_to_traces
 
 
 class LatticeSums(NamedTuple):
@@ -122,9 +121,8 @@ def response_of_lattice(
     departed, escapes, unfollowed = fates_after_first_scattering(
         scene, arrivals, unscattered(scattered), unscattered(escaped)
     )
-    monomials = histories.monomials(optics)
-    arrivals, departed = (einsum("mh,hw->wm", a, monomials)[..., None] for a in (arrivals, departed))
-    escapes, unfollowed = (einsum("h,hw->w", a, monomials)[:, None] for a in (escapes, unfollowed))
+    budget = (arrivals, departed, escapes, unfollowed)
+    arrivals, departed, escapes, unfollowed = histories_to_traces(budget, histories, optics)
     return Response(
         first=(reflectance[..., None] * weights[None])[:, :, None],
         higher=None,

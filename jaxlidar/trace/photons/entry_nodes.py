@@ -14,8 +14,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, PRNGKeyArray, UInt32
 
-from jaxlidar._vectors import Scalar, along, dot
-from jaxlidar.trace.device_scene import DeviceScene, not_scattered
+from jaxlidar._vectors import Scalar
+from jaxlidar.trace.device_scene import DeviceScene
+from jaxlidar.trace.photons.photon_step import start_photons
 from jaxlidar.trace.photons.photons import Photons
 from jaxlidar.trace.photons.random_numbers import random_words, shifted_lattices
 
@@ -73,30 +74,12 @@ class EntryNodes(eqx.Module):
         4. Its weight, the fraction of the node's light; zero for padding. The index of the node takes the
            place of the history.
         """
-        assert scene.optics is not None
         # Lanes beyond the last photon fill up the last chunk, with the weight zero.
         photon = jnp.minimum(lane, self.n_photons - 1)
         node, fraction = self.photon_node[photon], self.photon_fraction[photon]
         number, entry = self._sample_entries(node, self.photon_rank[photon], key)
-        point, w, excess = scene.beam.ray(entry)
-        to_start = jnp.asarray(-scene.limits.start_distance, excess.dtype)
         is_real = (lane < self.n_photons) & (fraction > 0)
-        # With shot views, times are relative to a shot whose axis goes through the point of entry:
-        # `ShotViews.seen_by_shots` adds the delay of each shot.
-        entry_path = 0.0 if scene.shot_views is None else 2.0 * dot(point, w)
-        photons = Photons(
-            x=along(point, w, to_start),
-            w=w,
-            path=excess + to_start - entry_path,
-            weight=jnp.where(is_real, fraction, 0.0),
-            history=node,
-            surface=jnp.full(lane.shape, -1, jnp.int32),
-            last_scattering=scene.if_differentiated(not_scattered(excess)),
-            alive=is_real,
-            optical_weights=tuple(jnp.ones_like(excess) for _ in range(scene.optics.shape[1])),
-            entry_point=None if scene.shot_views is None else entry,
-        )
-        return number, photons
+        return number, start_photons(scene, entry, jnp.where(is_real, fraction, 0.0), node, is_real)
 
     def ray_entries(
         self, key: PRNGKeyArray

@@ -45,7 +45,7 @@ from jaxlidar._constants import SPEED_OF_LIGHT
 from jaxlidar._jax.mesh_axes import vary_with
 from jaxlidar._jax.one_function import barrier
 from jaxlidar._jax.vmapped_loops import any_problem, largest_count
-from jaxlidar._vectors import FAR, Scalar, Vec, along
+from jaxlidar._vectors import FAR, Scalar, Vec
 from jaxlidar.trace.deposit import add_rows, bspline_row
 from jaxlidar.trace.derivatives.reparametrisation import (
     has_moving_landings,
@@ -57,7 +57,7 @@ from jaxlidar.trace.derivatives.score_functions import (
     collision_score,
     vertical_depth_slopes,
 )
-from jaxlidar.trace.device_scene import DeviceScene, not_scattered
+from jaxlidar.trace.device_scene import DeviceScene
 from jaxlidar.trace.first.footprint import GOLDEN, across_beam
 from jaxlidar.trace.march.flight import Flight, SurfaceEncounters, meet_surfaces, sample_flights
 from jaxlidar.trace.march.meshes import clear_of_mesh
@@ -65,7 +65,7 @@ from jaxlidar.trace.march.voxel_traversal import depth_to_top, march_to_depths
 from jaxlidar.trace.photons.collisions import collision_for_return, intensity_factors
 from jaxlidar.trace.photons.compaction import compact
 from jaxlidar.trace.photons.entry_nodes import EntryNodes
-from jaxlidar.trace.photons.photon_step import collide, passed_plates
+from jaxlidar.trace.photons.photon_step import collide, passed_plates, start_photons
 from jaxlidar.trace.photons.photons import (
     Collision,
     CollisionForReturn,
@@ -201,65 +201,69 @@ class PhotonBatch:
 
     def trace_orders(self, lanes: Lanes, sums: Sums, trace_chunk: TraceChunk) -> tuple[Lanes, Sums]:
         """Trace all orders of a group of photons by `trace_chunk`, which adds to `sums`."""
-        scene, chunk_size = self.scene, self.chunk_size
-
-        def one_order(carry, order):
-            """Trace one order of all chunks.
-
-            1. Compact: find the new order of living photons.
-            2. Gather a chunk of photons in that order.
-            3. Trace it, if any of them lives, and put it in its place; chunk after chunk.
-            """
-            lanes, sums = carry
-            # Late orders have few photons left, and their paths differ in length: sorted, whole chunks are
-            # dead or end together, and can be skipped.
-            source, n_living = compact(scene, lanes.photons)
-            # Photons are gathered chunk by chunk, in their new order: a sort of the whole state would copy
-            # all of it through memory.
-            flat = jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:]), lanes)
-
-            def gather(chunk) -> Lanes:
-                number = source[chunk]
-                in_chunk = jax.tree.map(lambda a: a.at[number].get(mode="promise_in_bounds"), flat)
-                alive = chunk * chunk_size + jnp.arange(chunk_size) < n_living
-                return barrier(eqx.tree_at(lambda c: c.photons.alive, in_chunk, alive))
-
-            def trace(in_chunk, sums):
-                draws = PhotonDraws.from_numbers(self.lattices(in_chunk.lane, order), scene.n_plates)
-                return trace_chunk(in_chunk, sums, draws, order)
-
-            # Reverse mode traces each chunk again, and keeps the intermediate values of one at a time.
-            trace_again = jax.checkpoint(trace) if scene.reverse else trace
-
-            def skip(in_chunk, sums):
-                return in_chunk, sums
-
-            def scanned_chunk(sums, chunk):
-                in_chunk = gather(chunk)
-                any_alive = any_problem(in_chunk.photons.alive)
-                in_chunk, sums = lax.cond(any_alive, trace_again, skip, in_chunk, sums)
-                return sums, in_chunk
-
-            def looped_chunk(chunk, state):
-                lanes, sums = state
-                in_chunk, sums = trace(gather(chunk), sums)
-                return jax.tree.map(lambda a, b: a.at[chunk].set(b), lanes, in_chunk), sums
-
-            if scene.reverse:
-                # Chunks of dead photons are skipped. The loop has a static length, as reverse mode needs.
-                sums, lanes = lax.scan(scanned_chunk, sums, jnp.arange(self.chunks_per_group))
-                return lanes, sums
-            # Chunks of dead photons are not even looked at.
-            none_alive = jnp.zeros_like(lanes.photons.alive)
-            all_dead = eqx.tree_at(lambda c: c.photons.alive, lanes, none_alive)
-            n_living_chunks = -(-largest_count(n_living) // chunk_size)
-            return lax.fori_loop(0, n_living_chunks, looped_chunk, (all_dead, sums))
 
         def order_step(carry, order):
             # The loop is as long as its size bucket; orders beyond the plan's are passed over.
-            return lax.cond(order < scene.orders, one_order, lambda c, _: c, carry, order), None
+            def trace(lanes: Lanes, sums: Sums) -> tuple[Lanes, Sums]:
+                return self.trace_order(lanes, sums, trace_chunk, order)
 
-        return lax.scan(order_step, (lanes, sums), jnp.arange(scene.config.order_steps))[0]
+            return lax.cond(order < self.scene.orders, trace, lambda *carry: carry, *carry), None
+
+        return lax.scan(order_step, (lanes, sums), jnp.arange(self.scene.config.order_steps))[0]
+
+    def trace_order(
+        self, lanes: Lanes, sums: Sums, trace_chunk: TraceChunk, order: Int[Array, ""]
+    ) -> tuple[Lanes, Sums]:
+        """Trace one order of all chunks of a group.
+
+        1. Compact: find the new order of living photons.
+        2. Gather a chunk of photons in that order.
+        3. Trace it, if any of them lives, and put it in its place; chunk after chunk.
+        """
+        scene, chunk_size = self.scene, self.chunk_size
+        # Late orders have few photons left, and their paths differ in length: sorted, whole chunks are
+        # dead or end together, and can be skipped.
+        source, n_living = compact(scene, lanes.photons)
+        # Photons are gathered chunk by chunk, in their new order: a sort of the whole state would copy
+        # all of it through memory.
+        flat = jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:]), lanes)
+
+        def gather(chunk) -> Lanes:
+            number = source[chunk]
+            in_chunk = jax.tree.map(lambda a: a.at[number].get(mode="promise_in_bounds"), flat)
+            alive = chunk * chunk_size + jnp.arange(chunk_size) < n_living
+            return barrier(eqx.tree_at(lambda c: c.photons.alive, in_chunk, alive))
+
+        def trace(in_chunk, sums):
+            draws = PhotonDraws.from_numbers(self.lattices(in_chunk.lane, order), scene.n_plates)
+            return trace_chunk(in_chunk, sums, draws, order)
+
+        # Reverse mode traces each chunk again, and keeps the intermediate values of one at a time.
+        trace_again = jax.checkpoint(trace) if scene.reverse else trace
+
+        def skip(in_chunk, sums):
+            return in_chunk, sums
+
+        def scanned_chunk(sums, chunk):
+            in_chunk = gather(chunk)
+            any_alive = any_problem(in_chunk.photons.alive)
+            in_chunk, sums = lax.cond(any_alive, trace_again, skip, in_chunk, sums)
+            return sums, in_chunk
+
+        def looped_chunk(chunk, state):
+            lanes, sums = state
+            in_chunk, sums = trace(gather(chunk), sums)
+            return jax.tree.map(lambda a, b: a.at[chunk].set(b), lanes, in_chunk), sums
+
+        if scene.reverse:
+            # Chunks of dead photons are skipped. The loop has a static length, as reverse mode needs.
+            sums, lanes = lax.scan(scanned_chunk, sums, jnp.arange(self.chunks_per_group))
+            return lanes, sums
+        # Chunks of dead photons are not even looked at.
+        none_alive = jnp.zeros_like(lanes.photons.alive)
+        all_dead = eqx.tree_at(lambda c: c.photons.alive, lanes, none_alive)
+        n_living_chunks = -(-largest_count(n_living) // chunk_size)
+        return lax.fori_loop(0, n_living_chunks, looped_chunk, (all_dead, sums))
 
 
 def trace_higher_orders(
@@ -356,10 +360,9 @@ def _send_photons(scene: DeviceScene, lane: UInt32[Array, "photons"], shift: Flo
 
     1. Point across the beam: the enclosed fraction of energy in equal steps, the direction by golden angles.
     2. Move it with the geometry (derivatives alone), with the ratio of its density.
-    3. Start above everything in the scene; the weight is 1 / (number of photons), zero for padding.
+    3. The weight is 1 / (number of photons), zero for padding.
     """
-    n_photons, slopes = scene.config.photons_per_batch, scene.slopes
-    n_wavelengths = 0 if scene.optics is None else scene.optics.shape[1]
+    n_photons = scene.config.photons_per_batch
     # Stratified in enclosed energy: every ring of equal energy gets one photon.
     fraction = (lane.astype(float) + shift[0]) / n_photons
     # Turns by the golden angle, in 32-bit integers: floats would lose the fraction of large numbers.
@@ -367,22 +370,8 @@ def _send_photons(scene: DeviceScene, lane: UInt32[Array, "photons"], shift: Flo
     # Lanes beyond the last photon fill up chunks.
     is_real = lane < n_photons
     across, ratio = rays_with_grids(scene, across_beam(scene.beam, fraction, turn))
-    point, w, excess = scene.beam.ray(across)
-    # Photons start at a plane above everything in the scene, not at the sensor: positions stay small enough
-    # for single precision.
-    to_start = jnp.asarray(-scene.limits.start_distance, excess.dtype)
-    return Photons(
-        x=along(point, w, to_start),
-        w=w,
-        path=excess + to_start,
-        weight=jnp.where(is_real, ratio / n_photons, 0.0),
-        history=jnp.zeros(lane.shape, jnp.int32),
-        surface=jnp.full(lane.shape, -1, jnp.int32),
-        last_scattering=scene.if_differentiated(not_scattered(excess)),
-        alive=is_real,
-        optical_weights=tuple(jnp.ones_like(excess) for _ in range(n_wavelengths)),
-        score=None if slopes is None else jnp.zeros((*lane.shape, slopes.count)),
-    )
+    weight = jnp.where(is_real, ratio / n_photons, 0.0)
+    return start_photons(scene, across, weight, jnp.zeros(lane.shape, jnp.int32), is_real)
 
 
 class FlownPhotons(NamedTuple):

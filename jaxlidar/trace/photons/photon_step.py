@@ -1,59 +1,58 @@
 """One step of photons, in the parts that all estimators share: fly, pass plates, collide.
 
-The response (`trace.photons.higher_orders`), absorption (`trace.photons.absorption`) and the estimator of
-the paper (`examples/paper`) follow photons in the same way, and differ in what they add to a tally on the
-way:
+The response (`trace.photons.higher_orders`), with the energy budget (`trace.photons.absorption`), and the
+estimator of the paper (`examples/paper`) follow photons in the same way, and differ in what they add to a
+tally on the way:
 
-1. `meet_surfaces` and `sample_flights` say where a flight ends (`trace.march.flight`); `fly_once` is both,
-   with independent random numbers and one end for each photon.
+1. `meet_surfaces` and `sample_flights` say where a flight ends (`trace.march.flight`).
 2. `passed_plates` says which plates the flight has passed, and which of these transmitted the photon.
 3. `collide` samples the collision at the end (`trace.photons.collisions`).
 """
 
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, PRNGKeyArray
+from jaxtyping import Array, Bool, Int
 
-from jaxlidar._vectors import FAR, Scalar, Vec, along
+from jaxlidar._vectors import FAR, Scalar, Vec, along, dot
 from jaxlidar.trace.device_scene import DeviceScene, not_scattered
-from jaxlidar.trace.march.flight import Flight, SurfaceEncounters, meet_surfaces, sample_flights
+from jaxlidar.trace.march.flight import Flight, SurfaceEncounters
 from jaxlidar.trace.photons.collisions import sample_collision
 from jaxlidar.trace.photons.photons import STOPPED, TRANSMITTED, Collision, Photons
 from jaxlidar.trace.photons.random_numbers import PhotonDraws
 
 
-def start_photons(x: Vec, w: Vec, path: Scalar) -> Photons:
-    """Return photons of the weight one, without a history, that start from no surface."""
-    zero = jnp.zeros(path.shape, jnp.int32)
-    return Photons(
-        x=x,
-        w=w,
-        path=path,
-        weight=jnp.ones_like(path),
-        history=zero,
-        surface=zero - 1,
-        last_scattering=not_scattered(path),
-        alive=zero == 0,
-    )
+def start_photons(
+    scene: DeviceScene,
+    entry: tuple[Scalar, Scalar],
+    weight: Scalar,
+    index: Int[Array, "photons"],
+    alive: Bool[Array, "photons"],
+) -> Photons:
+    """Start photons above everything in the scene, on the rays through `entry`, m across the beam.
 
-
-def fly_once(
-    scene: DeviceScene, p: Photons, key: PRNGKeyArray, max_length: Float[Array, "photons"]
-) -> tuple[PhotonDraws, SurfaceEncounters, Flight]:
-    """Sample one flight of each photon, of at most `max_length`, m, with independent random numbers.
-
-    **Returns:** the numbers, for the collision; the surfaces ahead; and the flight.
+    `index`: the history, or the entry node, which takes its place.
     """
-    # Not zero, whose logarithm would be an infinite optical depth.
-    tiny = jnp.finfo(p.weight.dtype).tiny
-    shape = (PhotonDraws.dimensions(scene.n_plates, return_path=False), p.weight.size)
-    uniform = jax.random.uniform(key, shape, p.weight.dtype, tiny)
-    draws = PhotonDraws.from_numbers(list(uniform), scene.n_plates)
-    encounters = meet_surfaces(scene, p, draws.plates_ahead)
-    flights = sample_flights(scene, p, encounters, max_length, draws.flight[None])
-    return draws, encounters, jax.tree.map(lambda a: a[0], flights)
+    point, w, excess = scene.beam.ray(entry)
+    # Not at the sensor: positions stay small enough for single precision.
+    to_start = jnp.asarray(-scene.limits.start_distance, excess.dtype)
+    # With shot views, times are relative to a shot whose axis goes through the point of entry:
+    # `ShotViews.seen_by_shots` adds the delay of each shot.
+    entry_path = 0.0 if scene.shot_views is None else 2.0 * dot(point, w)
+    n_wavelengths = 0 if scene.optics is None else scene.optics.shape[1]
+    return Photons(
+        x=along(point, w, to_start),
+        w=w,
+        path=excess + to_start - entry_path,
+        weight=weight,
+        history=index,
+        surface=jnp.full(index.shape, -1, jnp.int32),
+        last_scattering=scene.if_differentiated(not_scattered(excess)),
+        alive=alive,
+        optical_weights=tuple(jnp.ones_like(excess) for _ in range(n_wavelengths)),
+        entry_point=None if scene.shot_views is None else entry,
+        score=None if scene.slopes is None else jnp.zeros((*index.shape, scene.slopes.count)),
+    )
 
 
 class PlatePassage(NamedTuple):

@@ -15,6 +15,7 @@ footprints are summed afterwards (`trace_nodes`). Otherwise every deposit is add
 """
 
 import dataclasses
+import functools
 
 import jax
 import jax.numpy as jnp
@@ -25,14 +26,15 @@ from jaxlidar.sensors.lidar import Lidar
 from jaxlidar.trace.device_scene import DeviceScene, aim_at
 from jaxlidar.trace.first.first_order import FirstOrder, first_order
 from jaxlidar.trace.photons.entry_nodes import EntryNodes
-from jaxlidar.trace.photons.higher_orders import trace_higher_orders
-from jaxlidar.trace.photons.histories import Histories
+from jaxlidar.trace.photons.higher_orders import HigherOrderTally, trace_higher_orders
 from jaxlidar.trace.response import (
-    FirstOrderResponse,
+    FirstOrderWeights,
     Response,
-    apply_optics_to_first,
     first_order_response,
+    histories_to_traces,
+    join_orders,
     trace_first,
+    wavelengths_to_traces,
 )
 
 
@@ -58,42 +60,26 @@ def trace_nodes(scene: DeviceScene, nodes: EntryNodes, key: PRNGKeyArray) -> Res
     # Rays of one node are few; groups of equal size let one program trace the rays of all nodes.
     groups = jax.vmap(trace_group)(*nodes.ray_entries(ray_key), nodes.group_fraction)
     first = jax.tree.map(lambda a: jax.ops.segment_sum(a, nodes.group_node, n_nodes), groups)
+    histories, optics = scene.first_histories, scene.optics
+    apply_optics = jax.vmap(functools.partial(histories_to_traces, histories=histories, optics=optics))
     if not scene.config.follows_higher_orders:
         response = jax.vmap(lambda f: first_order_response(scene, f, f.weights))(first)
-        return jax.vmap(lambda r: apply_optics_to_first(r, scene))(response)
+        return apply_optics(jax.tree.map(lambda a: a[:, 0], response))
     # Order one has few histories, and keeps them until here; photons had optics applied on the way.
-    histories, optics = scene.first_histories, scene.optics
-    n_wavelengths = optics.shape[1]
-    higher = trace_higher_orders(scene, photon_key, nodes)
-
-    def by_node(a: Array) -> Array:
-        """Split entries into nodes and wavelengths, as leading axes."""
-        # Entries are the last axis but one of arrays with bins, else the last.
-        axis = a.ndim - (2 if a.ndim == 3 else 1)
-        a = a.reshape(*a.shape[:axis], n_nodes, n_wavelengths, *a.shape[axis + 1 :])
-        return jnp.moveaxis(a, (axis, axis + 1), (0, 1))
-
-    return Response(
-        first=_apply_optics(first.weights, histories, optics),
-        higher=jnp.expand_dims(by_node(higher.weights), 3),
-        first_outside=_apply_optics(first.outside[..., None], histories, optics)[..., 0],
-        higher_outside=by_node(higher.outside)[..., None],
-        arrived=by_node(higher.arrived)[..., None],
-        departed=by_node(higher.departed)[..., None],
-        escaped=by_node(higher.escaped)[..., None],
-        flown_outside=by_node(higher.flown_outside)[..., None],
-        unfollowed=by_node(higher.unfollowed)[..., None],
-    )
+    weights = apply_optics((first.weights, first.outside))
+    higher = _split_entries(trace_higher_orders(scene, photon_key, nodes), n_nodes)
+    return jax.vmap(join_orders)(weights, higher)
 
 
-def _apply_optics(
-    weights: Float[Array, "nodes *rows histories bins"],
-    histories: Histories,
-    optics: Float[Array, "channels wavelengths"],
-) -> Float[Array, "nodes wavelengths *rows 1 bins"]:
-    """Sum weights over histories with optics; wavelengths become the second axis."""
-    by_wavelength = einsum("hw,...hc->...wc", histories.monomials(optics), weights)
-    return jnp.expand_dims(jnp.moveaxis(by_wavelength, -2, 1), -2)
+def _split_entries(tally: HigherOrderTally, count: int) -> HigherOrderTally:
+    """Split entries into nodes, or shots, as the first axis, and wavelengths, as traces."""
+
+    def split(a: Array) -> Array:
+        # Entries come first, or after materials.
+        axis = min(a.ndim - 1, 1)
+        return jnp.moveaxis(a.reshape(*a.shape[:axis], count, -1, *a.shape[axis + 1 :]), axis, 0)
+
+    return jax.vmap(wavelengths_to_traces)(jax.tree.map(split, tally))
 
 
 def trace_shots(scene: DeviceScene, lidar: Lidar, nodes: EntryNodes, key: PRNGKeyArray) -> Response:
@@ -106,50 +92,37 @@ def trace_shots(scene: DeviceScene, lidar: Lidar, nodes: EntryNodes, key: PRNGKe
     3. The energy budget from nodes, by the coefficients of each shot's spline.
     4. Drop the dummy shot.
     """
-    views, optics = scene.shot_views, scene.optics
+    views = scene.shot_views
     assert views is not None
-    assert optics is not None
     ray_key, photon_key = jax.random.split(key)
-    higher = trace_higher_orders(scene, photon_key, nodes)
-    n_shots, n_wavelengths = views.n_shots, optics.shape[1]
+    tally = trace_higher_orders(scene, photon_key, nodes)
 
     # Order one is traced with the group of nodes that owns the shot, once; to other groups it adds zero.
     def to_all_shots(a: Array) -> Array:
-        return jnp.zeros((n_shots, *a.shape[1:]), a.dtype).at[views.first_order_shots].set(a)
-
-    def by_shot(a: Array) -> Array:
-        return jnp.moveaxis(a.reshape(len(a), n_shots, n_wavelengths, *a.shape[2:]), (1, 2), (0, 1))
+        return jnp.zeros((views.n_shots, *a.shape[1:]), a.dtype).at[views.first_order_shots].set(a)
 
     # The budget was tallied by node. To shots it goes by the splines' coefficients, with the grid's error,
     # which is tolerable for what no receiver records.
     def from_nodes(a: Array) -> Array:
-        by_node = a.reshape(*a.shape[:-1], -1, n_wavelengths)
-        return einsum("sn,...nw->sw...", views.node_coefficients, by_node)[..., None]
+        by_node = a.reshape(*a.shape[:-1], len(nodes.position), -1)
+        return einsum("sn,...nw->...sw", views.node_coefficients, by_node).reshape(*a.shape[:-1], -1)
 
+    names = ("arrived", "departed", "escaped", "flown_outside", "unfollowed")
+    tally = dataclasses.replace(tally, **{name: from_nodes(getattr(tally, name)) for name in names})
     first = jax.tree.map(to_all_shots, trace_first_of_shots(scene, lidar, views.first_order_shots, ray_key))
-    response = Response(
-        first=first.weights,
-        higher=jnp.expand_dims(by_shot(higher.weights), 3),
-        first_outside=first.outside,
-        higher_outside=by_shot(higher.outside)[..., None],
-        arrived=from_nodes(higher.arrived),
-        departed=from_nodes(higher.departed),
-        escaped=from_nodes(higher.escaped),
-        flown_outside=from_nodes(higher.flown_outside),
-        unfollowed=from_nodes(higher.unfollowed),
-    )
+    response = jax.vmap(join_orders)(first, _split_entries(tally, views.n_shots))
     # The last is the dummy shot.
     return jax.tree.map(lambda a: a[:-1], response)
 
 
 def trace_first_of_shots(
     scene: DeviceScene, lidar: Lidar, shots: Int[Array, "shots"], key: PRNGKeyArray
-) -> FirstOrderResponse:
+) -> FirstOrderWeights:
     """Trace order one of shots of `scene.shot_views`, one after the other, each from rays of its own beam."""
     views = scene.shot_views
     assert views is not None
 
-    def trace_shot(number: Array) -> FirstOrderResponse:
+    def trace_shot(number: Array) -> FirstOrderWeights:
         # The first order depends on the shot's own divergent rays: a narrow beam through a coarse map would
         # show the difference.
         shot_scene = aim_at(dataclasses.replace(scene, shot_views=None), lidar, views.position[number])
