@@ -351,9 +351,11 @@ class HeightField(AbstractShape):
                 continue
             indices = []
             for a, b, n in zip(first, last, heights.shape):
-                # The nodes of all cells that the box touches; in a periodic field, each node at most once.
-                nodes = np.arange(a, min(b, a + n) + 1)
-                indices.append(nodes % n if self.heights.periodic else np.unique(np.clip(nodes, 0, n - 1)))
+                # The nodes of all cells that the box touches, each node of a periodic field about once.
+                if self.heights.periodic:
+                    indices.append(np.arange(a, min(b, a + n) + 1) % n)
+                else:
+                    indices.append(np.arange(np.clip(a, 0, n - 1), np.clip(b, 0, n - 1) + 1))
             heights_in_box = heights[np.ix_(*indices)]
             low, high = heights_in_box.min(), heights_in_box.max()
         return (box, float(low), float(high)) if xp is np else (box, low, high)

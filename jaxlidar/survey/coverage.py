@@ -122,8 +122,8 @@ def ground_position(survey: Survey, scene: Scene) -> Float[np.ndarray, "shots 3"
 
     **Returns:** (shots, 3) x, y and z, m; NaN where an axis meets no ground.
 
-    `Survey.subset` of the shots that are not NaN is what a simulation over open terrain admits, but for those at
-    its border whose footprints lie partly off it.
+    Over open terrain a simulation admits the shots that are not NaN (`Survey.subset`), but for those at its
+    border whose footprints lie partly off it.
 
     **Raises:** TypeError for objects of the wrong type.
 

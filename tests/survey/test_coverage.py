@@ -22,3 +22,13 @@ def test_axes_beside_open_terrain_meet_no_ground():
     rest = survey.subset(np.flatnonzero(met))
     many = jl.simulate_many(rest, scene, key=jax.random.key(0), max_orders=1, rtol=0.1)
     np.testing.assert_allclose(many.ground_height, x[met], atol=1e-3)
+
+
+def test_bounds_of_a_terrain_hold_for_lines_that_begin_far_beside_it():
+    """Planted: nodes counted from the first line on, as many as the terrain has, end before the peak."""
+    heights = np.zeros((21, 11))
+    heights[18, 5] = 9.0
+    shape = jl.Terrain(heights, 1.0, (0.0, 0.0)).shape
+    points = np.array([[-30.0, 5.0, 20.0], [19.0, 5.0, 20.0]])
+    _, low, high = shape.height_bounds_below(points, np.array([[0.0, 0.0, -1.0]] * 2))
+    assert (low, high) == (0.0, 9.0)
