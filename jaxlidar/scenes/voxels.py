@@ -15,8 +15,8 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy
 from jaxtyping import Array, ArrayLike, Float
-from scipy import ndimage
 
 from jaxlidar._fields.checks import (
     as_array,
@@ -242,7 +242,7 @@ class VoxelMap(eqx.Module):
         is_occupied = self.mean_extinction() > 0
         if not is_occupied.any():
             is_occupied[0, 0, 0] = True
-        (occupied,) = ndimage.find_objects(is_occupied.astype(np.int8))
+        (occupied,) = scipy.ndimage.find_objects(is_occupied.astype(np.int8))
         first = [layers.start for layers in occupied]
         return VoxelMap(
             None if self.leaf is None else self.leaf[occupied],
