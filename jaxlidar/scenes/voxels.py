@@ -46,7 +46,8 @@ def _triple(field: str) -> Callable[[Numbers], Float[Array, "3"]]:
     def convert(x: Numbers) -> Float[Array, "3"]:
         a = as_array(x, field)
         check_shape(field, a, (), (3,))
-        return jnp.broadcast_to(a, (3,))
+        value = concrete(a)
+        return jnp.broadcast_to(a, (3,)) if value is None else as_array(np.broadcast_to(value, (3,)))
 
     return convert
 
@@ -223,7 +224,10 @@ class VoxelMap(eqx.Module):
         check_kind("leaf_angles", leaf_angles, str | LeafAngles, "a name or a LeafAngles")
         angles = LeafAngles.named(leaf_angles) if isinstance(leaf_angles, str) else leaf_angles
         spherical = isinstance(leaf_angles, str) and leaf_angles == "spherical"
-        return VoxelMap(0.5 * as_array(lad, "lad"), bark, voxel_size, origin, None if spherical else angles)
+        # By NumPy where values are known: JAX would compile a program for every shape.
+        density = concrete(lad)
+        leaf = 0.5 * (as_array(lad, "lad") if density is None else density)
+        return VoxelMap(leaf, bark, voxel_size, origin, None if spherical else angles)
 
     def trimmed(self) -> "VoxelMap":
         """Trim the empty layers at the sides. One voxel remains if all are empty.
