@@ -15,8 +15,8 @@ import dataclasses
 from typing import NamedTuple
 
 import numpy as np
+import scipy
 from jaxtyping import Bool, Float
-from scipy import linalg
 
 from inversion.fit.planning import sample_times
 from jaxlidar import Lidar, Plan, Waveform
@@ -62,13 +62,13 @@ class SampleNoise(NamedTuple):
         if self._is_diagonal:
             return scaled
         # Differences that are not finite, where a simulation failed, pass through: the solver rejects them.
-        return linalg.solve_triangular(self._cholesky, scaled, lower=True, check_finite=False)
+        return scipy.linalg.solve_triangular(self._cholesky, scaled, lower=True, check_finite=False)
 
     def times_precision(self, x: Float[np.ndarray, "samples ..."]) -> Float[np.ndarray, "samples ..."]:
         """Return C^-1 times differences, or columns of them."""
         whitened = self.whiten(x)
         if not self._is_diagonal:
-            whitened = linalg.solve_triangular(self._cholesky, whitened, lower=True, trans=1)
+            whitened = scipy.linalg.solve_triangular(self._cholesky, whitened, lower=True, trans=1)
         return self._over_sigma(whitened)
 
     @property
@@ -111,7 +111,7 @@ def shared_errors_of_samples(
     if errors is None:
         return None
     # Errors of one wavelength are zero at the samples of the others.
-    return np.asarray(linalg.block_diag(*(e[fitted] for e, fitted in zip(errors, is_fitted))))
+    return np.asarray(scipy.linalg.block_diag(*(e[fitted] for e, fitted in zip(errors, is_fitted))))
 
 
 def with_fixed_window(lidar: Lidar) -> Lidar:

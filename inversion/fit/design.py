@@ -40,8 +40,8 @@ import jax.flatten_util
 import jax.numpy as jnp
 import jax.scipy.linalg
 import numpy as np
+import scipy
 from jaxtyping import Array, ArrayLike, Bool, Float, PRNGKeyArray
-from scipy import optimize
 
 from inversion.fit.data import with_fixed_window
 from inversion.fit.design_trace import DivergenceNodes, TracedScene, refine_nodes, trace_for_design
@@ -299,7 +299,7 @@ class _DesignProblem(eqx.Module):
         # The cost is as precise as JAX's default float: steps below its rounding are noise, in which the line
         # search fails. In double precision it is the optimiser's own tolerance.
         tolerance = max(_ROUNDINGS * float(jnp.finfo(jnp.result_type(float)).eps), _FINEST_TOLERANCE)
-        return optimize.minimize(
+        return scipy.optimize.minimize(
             self.log_mean_cost,
             fraction,
             args=(traced_scenes,),

@@ -26,7 +26,7 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
-from scipy import linalg, optimize
+import scipy
 
 from inversion.fit.unknowns import BoundUnknown
 
@@ -54,7 +54,7 @@ class _GaussianProcess:
         covariance = smooth.correlation(n_layers) + _NUGGET * np.eye(n_layers)
         # Both for a strength of one: a strength only scales them.
         self.cholesky = np.linalg.cholesky(covariance + (_LEVEL_SIGMA**2 if smooth.mean is None else 0.0))
-        self.inverse_cholesky = linalg.solve_triangular(self.cholesky, np.eye(n_layers), lower=True)
+        self.inverse_cholesky = scipy.linalg.solve_triangular(self.cholesky, np.eye(n_layers), lower=True)
         self.log_determinant = 2.0 * float(np.sum(np.log(np.diag(self.cholesky))))
 
 
@@ -170,7 +170,7 @@ class PriorResiduals:
             # In logarithms: a strength is positive, and its plausible range spans orders of magnitude.
             interval = process.strength * np.array([1.0 / _MAX_FACTOR, _MAX_FACTOR])
             interval = np.log(np.clip(interval, *process.strength_range))
-            minimum: Any = optimize.minimize_scalar(criterion, bounds=interval, method="bounded")
+            minimum: Any = scipy.optimize.minimize_scalar(criterion, bounds=interval, method="bounded")
             strengths[i] = np.exp(minimum.x)
         return strengths
 
@@ -192,7 +192,7 @@ class PriorResiduals:
             prior_terms += residual @ residual + 2.0 * process.mean.size * np.log(strength)
         # H = L L^T: the cost at its minimum is less by |L^-1 gradient|^2.
         cholesky = np.linalg.cholesky(information)
-        decrease = linalg.solve_triangular(cholesky, gradient, lower=True)
+        decrease = scipy.linalg.solve_triangular(cholesky, gradient, lower=True)
         return float(prior_terms - decrease @ decrease + 2.0 * np.sum(np.log(np.diag(cholesky))))
 
 

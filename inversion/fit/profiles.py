@@ -21,8 +21,8 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
+import scipy
 from jaxtyping import Array, Float
-from scipy import special
 
 from jaxlidar import Plane, Scene, VoxelMap
 from jaxlidar.extend import as_array, check_kind, check_range, concrete
@@ -169,7 +169,7 @@ class AbstractPosterior(eqx.Module):
         stderr = np.asarray((self.robust_stderr if robust else self.stderr)[name], float)
         low, high = (np.broadcast_to(b, values.shape) for b in np.asarray(self.bounds[name], float))
         is_determined = np.isfinite(stderr)
-        half_width = special.ndtri(0.5 + 0.5 * level) * np.where(is_determined, stderr, 0.0)
+        half_width = scipy.special.ndtri(0.5 + 0.5 * level) * np.where(is_determined, stderr, 0.0)
         lower, upper = np.maximum(values - half_width, low), np.minimum(values + half_width, high)
         return np.where(is_determined, lower, low), np.where(is_determined, upper, high)
 

@@ -23,7 +23,7 @@ from typing import Any, Literal, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from scipy import linalg, optimize
+import scipy
 
 from inversion.fit.data import (
     ObservedWaveform,
@@ -229,18 +229,19 @@ class RecorderModel:
         bins, lags = self.receiver.bins, self.pulse.size
         # Returns are placed by the middle of the pulse's energy, which keeps most of an echo in the record.
         middle = int(np.argmax(np.cumsum(self.pulse) >= 0.5))
-        pulse_matrix = linalg.toeplitz(np.r_[self.pulse, np.zeros(bins - 1)], np.zeros(bins))
+        pulse_matrix = scipy.linalg.toeplitz(np.r_[self.pulse, np.zeros(bins - 1)], np.zeros(bins))
         unit_echoes = pulse_matrix[middle : middle + bins]
         noise_matrices = []
         for waveform in reflectance:
             # The solver's tolerances are absolute: the waveform is scaled to a peak of one.
             peak = max(float(np.max(waveform)), 1e-300)
             returns = (
-                optimize.nnls(unit_echoes, np.maximum(waveform, 0.0) / peak, maxiter=30 * bins)[0] * peak
+                scipy.optimize.nnls(unit_echoes, np.maximum(waveform, 0.0) / peak, maxiter=30 * bins)[0]
+                * peak
             )
             returns[returns < _FAINT * peak] = 0.0
             first_row = np.r_[returns[0], np.zeros(lags - 1)]
-            delayed = linalg.toeplitz(np.r_[returns, np.zeros(lags - 1)], first_row)
+            delayed = scipy.linalg.toeplitz(np.r_[returns, np.zeros(lags - 1)], first_row)
             noise_matrices.append(self._receive(delayed[middle : middle + bins].T, by_name).T)
         sigma = by_name.scale * float(self.recorder.pulse_noise) * float(np.max(self.pulse))
         return sigma * np.stack(noise_matrices)

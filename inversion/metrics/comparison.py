@@ -12,8 +12,8 @@ from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
+import scipy
 from jaxtyping import Float, Shaped
-from scipy import stats
 
 from jaxlidar.extend import as_numpy, check_number
 from jaxlidar.io import ShotTable
@@ -220,7 +220,7 @@ def _statistics(name: str, group: str, pair: ComparedColumn, sigmas: float) -> C
         return ComparisonStatistics(name, group, 0, *[float("nan")] * 6)
     rank = np.nan
     if difference.size >= _MIN_RANKED and np.ptp(pair.estimate) > 0 and np.ptp(pair.reference) > 0:
-        ranks = stats.rankdata(pair.estimate), stats.rankdata(pair.reference)
+        ranks = scipy.stats.rankdata(pair.estimate), scipy.stats.rankdata(pair.reference)
         rank = float(np.corrcoef(*ranks)[0, 1])
     has_error = np.isfinite(pair.stderr)
     is_covered = np.abs(difference) <= sigmas * pair.stderr

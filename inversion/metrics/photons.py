@@ -27,8 +27,8 @@ Geosci. Remote Sens. Lett. 12, 726; Rabiner (1989), Proc. IEEE 77, 257, for the 
 from typing import NamedTuple
 
 import numpy as np
+import scipy
 from jaxtyping import ArrayLike, Float, Int, Shaped
-from scipy import linalg, spatial, special, stats
 
 from inversion.fit.quality import Verdict
 from jaxlidar import SPEED_OF_LIGHT
@@ -232,7 +232,7 @@ def photon_ground_and_canopy(
     is_near = np.abs(above) <= _GROUND_RANGE
     near = np.bincount(number[is_near], minlength=n_segments)
     by_background = expected * lengths * 2.0 * _GROUND_RANGE
-    fewest = np.maximum(stats.poisson.isf(_FALSE_GROUND, by_background) + 1.0, _DOUBTFUL_PHOTONS)
+    fewest = np.maximum(scipy.stats.poisson.isf(_FALSE_GROUND, by_background) + 1.0, _DOUBTFUL_PHOTONS)
     # Good ground: where the dense surface has more photons than background gives any slab of the window, the
     # test for one place is enough. Elsewhere the count must be rare over all places.
     slab, window = _SLAB * _SURFACE_STEP, float(np.ptp(photons.window))
@@ -254,7 +254,7 @@ def photon_ground_and_canopy(
     # Its median tells how deep it is: the percentile may be a stray's.
     median, _ = _percentiles(above[is_canopy], number[is_canopy], n_segments, 50.0, least)
     background_count = expected * lengths * np.maximum(np.nan_to_num(median) - clearance, 0.0)
-    fewest_canopy = stats.poisson.isf(_FALSE_CANOPY, background_count) + 1.0
+    fewest_canopy = scipy.stats.poisson.isf(_FALSE_CANOPY, background_count) + 1.0
     has_canopy = np.isfinite(height) & (count >= fewest_canopy)
     is_canopy &= has_canopy[number]
     is_ground = is_signal & is_near & has_ground[number]
@@ -271,7 +271,7 @@ def photon_ground_and_canopy(
     is_below = (above < -_DEPTH_RANGE[0]) & (above > -_DEPTH_RANGE[1])
     below = _moving_sum(np.bincount(number[is_below], minlength=n_segments), _DEPTH_NEIGHBOURS)
     depth_background = _moving_sum(expected * lengths, _DEPTH_NEIGHBOURS) * np.ptp(_DEPTH_RANGE)
-    is_deeper = below > stats.poisson.isf(_FALSE_DEPTH, depth_background)
+    is_deeper = below > scipy.stats.poisson.isf(_FALSE_DEPTH, depth_background)
     # The ground is sought by the echo of level ground. On a slope it is wider, and its upper half passes for
     # low plants over a ground that is too low.
     is_steep = _FOOTPRINT * np.abs(slope) > _ECHO_WIDTH
@@ -437,7 +437,7 @@ def _dense_surface(photons: _Photons) -> _Curve:
     area = photons.length / middle.size * _SLAB * _SURFACE_STEP
     expected = max(background, _LEAST_BACKGROUND) * area
     slab = np.stack([np.convolve(cell, np.ones(_SLAB), mode="same") for cell in count])
-    ratio = special.xlogy(slab, slab / expected) - slab + expected
+    ratio = scipy.special.xlogy(slab, slab / expected) - slab + expected
     evidence = np.where(slab > expected, ratio, 0.0)
     cost = _SURFACE_STEP / _SURFACE_CHANGE * np.arange(levels)
 
@@ -549,7 +549,7 @@ def _smoothed(height: np.ndarray, weight: np.ndarray, step: float) -> np.ndarray
         for m, b in enumerate(stencil):
             # In band form, element (row, column) lies at (2 + row - column, column).
             bands[2 + k - m, m : m + height.size - 2] += penalty * a * b
-    return linalg.solve_banded((2, 2), bands, weight * height)
+    return scipy.linalg.solve_banded((2, 2), bands, weight * height)
 
 
 def _log_likelihood(height: np.ndarray, offsets: np.ndarray, background: float, length: float) -> np.ndarray:
@@ -613,7 +613,7 @@ def _posterior(evidence: np.ndarray, offsets: np.ndarray) -> np.ndarray:
 def _rare_count(expected: np.ndarray, places: np.ndarray | float) -> np.ndarray:
     """Return the smallest count that background reaches at any of `places` places only by `_FALSE_GOOD`."""
     probability = np.minimum(_FALSE_GOOD / np.maximum(places, 1.0), 1.0)
-    return stats.poisson.isf(probability, expected) + 1.0
+    return scipy.stats.poisson.isf(probability, expected) + 1.0
 
 
 def _verdict(
@@ -649,7 +649,7 @@ def _verdict(
 def _fewest_neighbours(density: np.ndarray) -> np.ndarray:
     """Fewest neighbours of signal, by the Poisson distribution of those of background."""
     expected = np.pi * _ALONG * _HIGH * density
-    return np.maximum(stats.poisson.isf(_FALSE_ALARM, expected) + 1.0, _FEWEST_NEIGHBOURS)
+    return np.maximum(scipy.stats.poisson.isf(_FALSE_ALARM, expected) + 1.0, _FEWEST_NEIGHBOURS)
 
 
 def _count_neighbours(x: np.ndarray, z: np.ndarray) -> np.ndarray:
@@ -657,7 +657,7 @@ def _count_neighbours(x: np.ndarray, z: np.ndarray) -> np.ndarray:
     if x.size == 0:
         return np.zeros(0)
     scaled = np.stack([x / _ALONG, z / _HIGH], axis=1)
-    return spatial.KDTree(scaled).query_ball_point(scaled, 1.0, return_length=True) - 1
+    return scipy.spatial.KDTree(scaled).query_ball_point(scaled, 1.0, return_length=True) - 1
 
 
 def _percentiles(

@@ -26,8 +26,8 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
+import scipy
 from jaxtyping import Float
-from scipy import optimize, sparse
 
 from jaxlidar.extend import as_numpy, check_number, check_range
 
@@ -181,11 +181,11 @@ def _fit_response(echoes: np.ndarray, spectra: np.ndarray) -> tuple[float, float
         return (amplitude[:, None] * model - weight * echoes).ravel()
 
     # A position moves the residuals of its own shot only: all positions share one difference quotient.
-    of_position = sparse.kron(sparse.eye(shots), np.ones((samples, 1)))
-    sparsity = sparse.hstack([np.ones((shots * samples, 3)), of_position])
+    of_position = scipy.sparse.kron(scipy.sparse.eye(shots), np.ones((samples, 1)))
+    sparsity = scipy.sparse.hstack([np.ones((shots * samples, 3)), of_position])
     low, high = np.r_[_LOW, np.full(shots, -30.0)], np.r_[_HIGH, np.full(shots, 30.0)]
     # Squares of residuals below 2 % of the peak, magnitudes above: a shot with plants does not decide alone.
-    fit = optimize.least_squares(
+    fit = scipy.optimize.least_squares(
         residuals,
         np.r_[_START, np.zeros(shots)],
         bounds=(low, high),

@@ -42,8 +42,8 @@ from typing import Any, NamedTuple
 
 import jax
 import numpy as np
+import scipy
 from jaxtyping import ArrayLike, Bool, Float, Int, PRNGKeyArray
-from scipy import optimize
 from scipy.sparse import linalg as sparse_linalg
 
 from inversion.fit.data import as_noise, as_sample_times, with_fixed_window
@@ -653,7 +653,7 @@ def _fit(
             raise StopIteration
 
     if not (stopped or at_minimum) and len(history) < max_steps:
-        result = optimize.minimize(
+        result = scipy.optimize.minimize(
             objective,
             last_x / scale,
             jac=True,

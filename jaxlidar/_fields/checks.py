@@ -40,7 +40,7 @@ def as_scalar(x: ArrayLike, field: str = "value") -> Float[Array, ""]:
     a = as_array(x, field)
     if a.size != 1:
         raise ValueError(f"{field} has shape {a.shape}; admissible is one number")
-    return a.reshape(())
+    return a.reshape(()) if a.ndim else a
 
 
 def as_optional_scalar(x: ArrayLike | None, field: str = "value") -> Float[Array, ""] | None:
@@ -59,9 +59,9 @@ def as_array(x: ArrayLike | Sequence, field: str = "value") -> Float[Array, "...
     values = concrete(x)
     if values is None:
         return jnp.asarray(x, dtype=float)
-    # By NumPy: JAX would compile a conversion for every shape.
+    # By NumPy and `device_put`: `jnp.asarray` compiles a program for every shape.
     with np.errstate(over="ignore"):
-        return jnp.asarray(values.astype(jnp.result_type(float)))
+        return jax.device_put(values.astype(jnp.result_type(float)))
 
 
 def as_numpy(x: Any, field: str = "value") -> Float[np.ndarray, "..."]:

@@ -332,7 +332,7 @@ def material(leaf: Prospect, wavelengths: Any) -> tuple[Array, LeafSurface]:
     x = as_numpy(wavelengths, "wavelengths")
     check_range("wavelengths", x, table.wavelength[0], table.wavelength[-1])
     absorption, face = _tabulated(table, x.tobytes(), x.shape, leaf.alpha)
-    return jnp.asarray(absorption, dtype), face
+    return jax.device_put(absorption.astype(dtype)), face
 
 
 @functools.lru_cache(maxsize=64)

@@ -8,11 +8,12 @@ weight prod_s optics_s ** n_s; the tuple (n_s) is its history.
 from collections import Counter
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxlidar._fields.checks import concrete, fixed_array
+from jaxlidar._fields.checks import concrete, fixed_array, has_tracers
 from jaxlidar.optics.phase import AbstractPhase
 from jaxlidar.optics.spectra import reflectance_at
 from jaxlidar.planning.config import Scatterer
@@ -111,7 +112,10 @@ def channel_optics(
         if material_optics.transmittance is not None:
             values[f"{material_optics.name}.T"] = material_optics.transmittance
     rows = [values[channel] for channel in channels]
-    return jnp.stack(rows) if rows else jnp.zeros((0, lidar.wavelength.size))
+    if not rows:
+        return jnp.zeros((0, lidar.wavelength.size))
+    # By NumPy where values are known: JAX would compile a program for every shape.
+    return jnp.stack(rows) if has_tracers(rows) else jax.device_put(np.stack(rows))
 
 
 def largest_albedo(optics: list[MaterialOptics], xp: Any = np) -> Any:

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from jaxlidar._fields.checks import concrete
+from jaxlidar._fields.checks import as_array, concrete
 from jaxlidar.scenes.scene import Scene
 from jaxlidar.sensors.lidar import Lidar
 
@@ -32,7 +32,7 @@ def move_aim_to_origin(lidar: Lidar, scene: Scene) -> tuple[Lidar, Scene]:
     moved = [surface.moved(-aim) for surface in surfaces]
     stays = not aim.any() or any(surface is None for surface in moved)
     new_aim = aim if stays else np.zeros(2)
-    lidar = eqx.tree_at(lambda a: a.position, lidar, jnp.asarray(np.append(new_aim, height), float))
+    lidar = eqx.tree_at(lambda a: a.position, lidar, as_array(np.append(new_aim, height)))
     surfaces = surfaces if stays else tuple(moved)
     # `surfaces` has the ground first, if there is one, then the plates and the meshes.
     n_grounds = len(surfaces) - len(scene.plates) - len(scene.meshes)
@@ -60,4 +60,4 @@ def move_aim_to_origin(lidar: Lidar, scene: Scene) -> tuple[Lidar, Scene]:
 def _subtract_in_double(a: Array | np.ndarray, b: np.ndarray) -> Array:
     """Return a - b in JAX's default precision, subtracted in double precision unless `a` is traced."""
     value = concrete(a)
-    return jnp.asarray(a, float) - b if value is None else jnp.asarray(value - b, float)
+    return jnp.asarray(a, float) - b if value is None else as_array(value - b)

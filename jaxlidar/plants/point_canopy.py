@@ -39,8 +39,8 @@ Remote Sens. 41, 872.
 from typing import NamedTuple
 
 import numpy as np
+import scipy
 from jaxtyping import Bool, Float, Int
-from scipy import ndimage, spatial
 
 from jaxlidar._fields.checks import check_kind, check_range, check_shape
 from jaxlidar.optics.leaf_angles import LeafAngles
@@ -286,7 +286,7 @@ def _moved_layers(
 def _smooth(values: np.ndarray, sigma: float, grid: Grid) -> np.ndarray:
     """Smooth values of voxels or columns horizontally by a Gaussian, m; nothing lies beyond the grid."""
     widths = (*(sigma / grid.size[:2]), 0.0)[: values.ndim]
-    return ndimage.gaussian_filter(values, widths, mode="constant", truncate=3.0)
+    return scipy.ndimage.gaussian_filter(values, widths, mode="constant", truncate=3.0)
 
 
 def _filled_up(
@@ -341,14 +341,14 @@ def _lowest_surface(points: PointCloud) -> Bool[np.ndarray, " n"]:
     raster = np.full(tuple(cell.max(axis=0) + 1), np.inf)
     np.minimum.at(raster, tuple(cell.T), position[last, 2])
     is_empty = np.isinf(raster)
-    nearest = ndimage.distance_transform_edt(is_empty, return_distances=False, return_indices=True)
+    nearest = scipy.ndimage.distance_transform_edt(is_empty, return_distances=False, return_indices=True)
     assert nearest is not None
     heights = raster[tuple(nearest)]
     is_object, radius = np.zeros(raster.shape, bool), 1
     while radius * _RASTER_EDGE <= min(_MAX_RADIUS, 0.5 * min(raster.shape) * _RASTER_EDGE):
         steps = np.arange(-radius, radius + 1)
         disc = np.add.outer(steps**2, steps**2) <= radius**2
-        opened = ndimage.grey_opening(heights, footprint=disc, mode="nearest")
+        opened = scipy.ndimage.grey_opening(heights, footprint=disc, mode="nearest")
         is_object |= heights - opened > max(_SLOPE * radius * _RASTER_EDGE, _GROUND_DISTANCE)
         radius *= 2
     # The lowest return of each ground cell makes the surface.
@@ -397,7 +397,7 @@ def _fitted_heights(
     """
     count = min(_PLANE_RETURNS, len(ground))
     middle = ground.mean(axis=0)
-    distance, index = spatial.KDTree(ground[:, :2] - middle[:2]).query(place - middle[:2], k=count)
+    distance, index = scipy.spatial.KDTree(ground[:, :2] - middle[:2]).query(place - middle[:2], k=count)
     distance, index = distance.reshape(len(place), count), index.reshape(len(place), count)
     width = np.maximum(distance[:, count // 2], 0.7 * spacing)[:, None]
     # Relative to the nearest return: far from all of them, weights would all be zero.

@@ -5,8 +5,8 @@ from dataclasses import dataclass, fields, replace
 from typing import final
 
 import numpy as np
+import scipy
 from jaxtyping import Bool, Float, Int
-from scipy import spatial
 
 from jaxlidar._fields.checks import check_kind, check_number, check_range, check_shape
 
@@ -143,7 +143,7 @@ class Tree:
         # A hull has an area where points are not on one line.
         if np.linalg.matrix_rank(points - points.mean(axis=0) if len(points) else points, tol=1e-9) < 2:
             return 0.0
-        return float(2.0 * np.sqrt(spatial.ConvexHull(points).volume / np.pi))
+        return float(2.0 * np.sqrt(scipy.spatial.ConvexHull(points).volume / np.pi))
 
     @property
     def smallest_diameter(self) -> float:

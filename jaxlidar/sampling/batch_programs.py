@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray, UInt32
 
-from jaxlidar._fields.checks import has_tracers
+from jaxlidar._fields.checks import as_array, has_tracers
 from jaxlidar._jax.programs import Program
 from jaxlidar.planning.setup import Setup
 from jaxlidar.spectral.apply_optics import (
@@ -133,7 +133,7 @@ class BatchTracer(NamedTuple):
 
     def waveform(self, total: Response, batches: int) -> Waveform:
         """Make the waveform of the sum of the responses of some batches, without padding."""
-        wave = _compiled_waveform(total, jnp.asarray(float(batches)), self.model)
+        wave = _compiled_waveform(total, as_array(batches), self.model)
         return remove_padding(wave, self.setup.lidar.wavelength.size, self.setup.plan.n_samples)
 
 
@@ -163,7 +163,7 @@ def make_batch_tracer(setup: Setup, key: PRNGKeyArray) -> BatchTracer:
     model = make_model(setup)
     error_model = model if exact_sizes else model.at_pivots()
     if response_shapes is not None:
-        _compiled_waveform.compile_ahead(response_shapes, jnp.asarray(1.0), model)
+        _compiled_waveform.compile_ahead(response_shapes, as_array(1.0), model)
         _compiled_estimate.compile_ahead(response=response_shapes, model=error_model)
         _compiled_sum.compile_ahead(response_shapes, response_shapes)
     return BatchTracer(setup, finish_scene(), model, error_model)

@@ -8,8 +8,8 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy
 from jaxtyping import Array, Float
-from scipy.ndimage import map_coordinates
 
 from jaxlidar._fields.checks import check_kind, concrete, concrete_array, has_tracers, kind_of
 from jaxlidar._fields.ranges import Range
@@ -191,7 +191,9 @@ def _clearance(terrain: Terrain, points: Float[np.ndarray, "*n 3"]) -> Float[np.
     heights, origin, spacing = (concrete_array(a) for a in (terrain.heights, terrain.origin, terrain.spacing))
     nodes = np.moveaxis((points[..., :2] - origin) / spacing, -1, 0)
     mode = "grid-wrap" if terrain.sides == "periodic" else "constant"
-    return points[..., 2] - map_coordinates(heights.astype(float), nodes, order=1, mode=mode, cval=np.nan)
+    return points[..., 2] - scipy.ndimage.map_coordinates(
+        heights.astype(float), nodes, order=1, mode=mode, cval=np.nan
+    )
 
 
 def _corners_of_cells(terrain: Terrain) -> Float[np.ndarray, "cells 4 3"]:

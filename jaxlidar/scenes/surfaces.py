@@ -368,5 +368,5 @@ def _moved(surface: PlaneSurface, by: Float[np.ndarray, "2"]) -> PlaneSurface:
     downhill = np.stack([np.sin(np.deg2rad(aspect)), np.cos(np.deg2rad(aspect))])
     rise, height = np.tan(np.deg2rad(slope)) * downhill @ position, concrete(surface.height)
     height_at_origin = (surface.height if height is None else height) + rise
-    fields = (jnp.asarray(height_at_origin, float), jnp.asarray(np.zeros_like(position), float))
+    fields = (as_array(height_at_origin), as_array(np.zeros_like(position)))
     return eqx.tree_at(lambda s: (s.height, s.position), surface, fields)

@@ -15,8 +15,8 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy
 from jaxtyping import Array, ArrayLike, Float
-from scipy import ndimage
 
 from jaxlidar._fields.checks import (
     as_array,
@@ -46,7 +46,8 @@ def _triple(field: str) -> Callable[[Numbers], Float[Array, "3"]]:
     def convert(x: Numbers) -> Float[Array, "3"]:
         a = as_array(x, field)
         check_shape(field, a, (), (3,))
-        return jnp.broadcast_to(a, (3,))
+        value = concrete(a)
+        return jnp.broadcast_to(a, (3,)) if value is None else as_array(np.broadcast_to(value, (3,)))
 
     return convert
 
@@ -223,7 +224,10 @@ class VoxelMap(eqx.Module):
         check_kind("leaf_angles", leaf_angles, str | LeafAngles, "a name or a LeafAngles")
         angles = LeafAngles.named(leaf_angles) if isinstance(leaf_angles, str) else leaf_angles
         spherical = isinstance(leaf_angles, str) and leaf_angles == "spherical"
-        return VoxelMap(0.5 * as_array(lad, "lad"), bark, voxel_size, origin, None if spherical else angles)
+        # By NumPy where values are known: JAX would compile a program for every shape.
+        density = concrete(lad)
+        leaf = 0.5 * (as_array(lad, "lad") if density is None else density)
+        return VoxelMap(leaf, bark, voxel_size, origin, None if spherical else angles)
 
     def trimmed(self) -> "VoxelMap":
         """Trim the empty layers at the sides. One voxel remains if all are empty.
@@ -242,7 +246,7 @@ class VoxelMap(eqx.Module):
         is_occupied = self.mean_extinction() > 0
         if not is_occupied.any():
             is_occupied[0, 0, 0] = True
-        (occupied,) = ndimage.find_objects(is_occupied.astype(np.int8))
+        (occupied,) = scipy.ndimage.find_objects(is_occupied.astype(np.int8))
         first = [layers.start for layers in occupied]
         return VoxelMap(
             None if self.leaf is None else self.leaf[occupied],

@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Array, PRNGKeyArray
 
 from jaxlidar._fields.checks import (
+    as_array,
     check_flag,
     check_integer,
     check_key,
@@ -299,7 +300,9 @@ def _make_waveform(tracer: BatchTracer, result: _BatchResults, goal: _Goal) -> W
                 "begins; admissible is 'fixed': apply first_return_window outside"
             )
         return wave
-    refuse_excess(np.asarray(budget_excess(wave.energy_budget, result.energy_budget_stderr or {})))
+    # By NumPy: JAX would compile a program for each of these operations.
+    budgets = jax.device_get((wave.energy_budget, result.energy_budget_stderr or {}))
+    refuse_excess(budget_excess(*budgets))
     # Heights tell the zenith angle of a waveform's lidar, and nothing else its altitude.
     wave = dataclasses.replace(
         wave, info={**result.info, "altitude": None if lidar.altitude is None else float(lidar.altitude)}
@@ -481,8 +484,8 @@ def _trace_batches(
     return _BatchResults(
         response_sum=estimate.response_sum,
         batches=estimate.n_batches,
-        stderr=jnp.asarray(errors.stderr),
-        energy_budget_stderr=dict(zip(estimate.budget_names, map(jnp.asarray, estimate.budgets.stderr))),
+        stderr=as_array(errors.stderr),
+        energy_budget_stderr=dict(zip(estimate.budget_names, map(as_array, estimate.budgets.stderr))),
         info=info,
         unfollowed_fraction=unfollowed_fraction,
         needs_more_orders=needs_more_orders,

@@ -18,12 +18,13 @@ from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jaxlidar._constants import SPEED_OF_LIGHT
-from jaxlidar._fields.checks import as_array
+from jaxlidar._fields.checks import array_namespace, as_array
 from jaxlidar._jax.products import einsum
 from jaxlidar._jax.programs import Program
 from jaxlidar.planning.channels import channel_optics
@@ -193,7 +194,7 @@ class WaveformModel(eqx.Module):
             if a.ndim == 0 or (a.shape[axis] == 1 and n_original > 1):
                 return a
             last = np.repeat(np.take(np.asarray(a), [-1], axis), missing, axis)
-            return jnp.asarray(np.concatenate([a, last], axis))
+            return jax.device_put(np.concatenate([a, last], axis))
 
         def pad_or_none(a: Array | None) -> Array | None:
             return None if a is None else pad(a)
@@ -472,15 +473,16 @@ class BudgetTerms(NamedTuple):
 
 
 def budget_excess(
-    energy_budget: Mapping[str, Float[Array, "wavelengths"]],
-    stderr: Mapping[str, Float[Array, "wavelengths"]],
-) -> Float[Array, ""]:
+    energy_budget: Mapping[str, Float[Any, "wavelengths"]],
+    stderr: Mapping[str, Float[Any, "wavelengths"]],
+) -> Float[Any, ""]:
     """Return by how much the fractions of an energy budget sum to more than 1 and five standard errors.
 
     It is the largest of all wavelengths. The error of a sum is at most the sum of the errors.
     """
     total = sum(energy_budget.values())
-    return jnp.max(jnp.asarray(total - 1.0 - 5.0 * sum(stderr.values())))
+    excess = total - 1.0 - 5.0 * sum(stderr.values())
+    return array_namespace(excess).max(excess)
 
 
 def refuse_excess(excess: Float[Any, "*shots"]) -> None:

@@ -41,8 +41,8 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy
 from jaxtyping import Array, Float, Int, PRNGKeyArray
-from scipy import sparse
 
 from jaxlidar._fields.checks import as_array
 from jaxlidar._jax.programs import Program
@@ -439,8 +439,8 @@ def trace_group(
         # padding.
         unit_diagonal = np.ones(len(group.shots), np.float32)
         shape = (len(group.shots), context.view_geometry.max_shots)
-        diagonal = sparse.dia_array((unit_diagonal, 0), shape)
-        coefficients = sparse.csr_array(diagonal)
+        diagonal = scipy.sparse.dia_array((unit_diagonal, 0), shape)
+        coefficients = scipy.sparse.csr_array(diagonal)
     light = GroupLight(_nodes(group, context.spacing), shot_views, as_array(group.aim))
 
     def trace(numbers: range) -> RunningMoments:

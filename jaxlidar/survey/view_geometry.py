@@ -12,8 +12,8 @@ from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
+import scipy
 from jaxtyping import Float
-from scipy import spatial
 
 from jaxlidar._fields.checks import concrete_number
 from jaxlidar.planning.size_buckets import size_bucket
@@ -125,7 +125,7 @@ class ViewGeometry(NamedTuple):
         middle = np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1).reshape(-1, 2)
         # Half the diagonal of a cell: its corners are that much farther than its middle.
         distance = self.extent + edge * math.sqrt(0.5)
-        tree = spatial.KDTree(self._across(shot_position))
+        tree = scipy.spatial.KDTree(self._across(shot_position))
         shots = tree.query_ball_point(self._across(middle), distance, return_sorted=True)
         return CandidateCells(low, edge, (len(x), len(y)), shots)
 
