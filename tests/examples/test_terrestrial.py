@@ -16,7 +16,7 @@ def test_a_scan_sees_the_tree_and_the_ground(tmp_path):
     assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
-    returns = module.main(["--step", "4", "--out", str(tmp_path)])
+    returns = module.main(["--step", "3", "--out", str(tmp_path)])
     # Ranges count from the scanner.
     distance = np.linalg.norm(returns.position - module.SENSOR, axis=1)
     assert np.allclose(distance, returns.range, atol=0.01)

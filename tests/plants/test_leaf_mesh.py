@@ -243,6 +243,107 @@ def test_copies_like_no_other_are_one_mesh():
     assert np.all(single.bounds()[0, 0] > (4.0, -4.0, -1.0))
 
 
+# -- scans and waveforms -----------------------------------------------------------------------------------
+
+
+def plot_of_crowns(lai_factor=1.0):
+    """Ellipsoids of leaves from about 2 m to 6 to 11 m over 40 m by 40 m, in voxels of 0.5 m."""
+    random = np.random.default_rng(1)
+    place = 0.5 * np.moveaxis(np.indices((80, 80, 24)), 0, -1) + 0.25
+    density = np.zeros((80, 80, 24))
+    for x, y in itertools.product(np.arange(2.5, 40.0, 5.0), repeat=2):
+        stands, dx, dy, radius, top, bottom = random.uniform(
+            [0, -1, -1, 1.2, 6.0, 1.8], [1, 1, 1, 2.2, 11, 3]
+        )
+        if stands < 0.7:
+            centre = np.array([x + dx, y + dy, 0.5 * (top + bottom)])
+            inside = (((place - centre) / [radius, radius, 0.5 * (top - bottom)]) ** 2).sum(axis=-1) < 1.0
+            density[inside] = 0.7 * lai_factor
+    return jl.VoxelMap.from_lad(density, voxel_size=0.5)
+
+
+RINGS = ((0.0, 30.0), (50.0, 65.0), (80.0, 90.0))
+SENSOR = np.array([20.0, 20.0, 1.5])
+
+
+def scan_of_rings(n):
+    """Return n shots of a VZ-400 in each of three rings of zenith angles, even by solid angle."""
+    random = np.random.default_rng(0)
+    up = [random.uniform(np.cos(np.deg2rad(b)), np.cos(np.deg2rad(a)), n) for a, b in RINGS]
+    zenith, azimuth = 180.0 - np.rad2deg(np.arccos(np.concatenate(up))), random.uniform(0.0, 360.0, 3 * n)
+    sensor = np.tile(SENSOR, (3 * n, 1))
+    return jl.Survey(jl.instrument("RIEGL VZ-400"), sensor=sensor, zenith=zenith, azimuth=azimuth)
+
+
+def true_gaps(voxels, survey):
+    """Return the mean gap probability of the axes of shots in each ring, by steps of 2 cm."""
+    depth = np.zeros(len(survey))
+    for distance in np.arange(0.01, 40.0, 0.02):
+        index = np.floor((SENSOR + distance * survey.direction) / 0.5).astype(int)
+        inside = np.all((index >= 0) & (index < voxels.shape), axis=1)
+        depth[inside] += 0.02 * np.asarray(voxels.leaf, float)[tuple(index[inside].T)]
+    return np.exp(-depth).reshape(3, -1).mean(axis=1)
+
+
+def shares_without_return(survey, scene, least_reflectance):
+    many = jl.simulate_many(survey, scene, key=KEY, rtol=0.3, max_orders=1)
+    returns = many.returns()
+    is_hit = np.zeros(len(survey), bool)
+    is_hit[returns.shot[returns.reflectance >= least_reflectance]] = True
+    return 1.0 - is_hit.reshape(3, -1).mean(axis=1)
+
+
+@pytest.mark.slow
+def test_a_terrestrial_scan_recovers_the_gap_fraction():
+    """Shots without a return brighter than 0.05: the edge of a leaf returns a little of a beam."""
+    voxels, survey = plot_of_crowns(), scan_of_rings(3000)
+    true, least = true_gaps(voxels, survey), 0.05
+    over_leaves = shares_without_return(survey, jl.Scene(meshes=[leaves_of(voxels)]), least)
+    np.testing.assert_allclose(over_leaves, true, atol=0.02)
+    # Voxels return the expected light, and half of the leaves pass more.
+    with pytest.warns(UserWarning, match="see crowns alone"):
+        over_voxels = shares_without_return(survey, jl.Scene(canopy=jl.Canopy(voxels, leaf=LEAF)), least)
+    assert np.all(over_voxels < true - 0.05)
+    few, half = scan_of_rings(500), jl.Scene(meshes=[leaves_of(plot_of_crowns(0.5))])
+    assert np.all(shares_without_return(few, half, least) > true_gaps(voxels, few) + 0.02)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("zenith", [0.0, 30.0, 60.0])
+def test_the_mean_waveform_is_that_of_the_voxels(zenith):
+    """200 shots through leaves of their own: as many realisations."""
+    voxels = jl.VoxelMap.from_lad(
+        np.full((16, 8, 4), 0.75), voxel_size=(2.0, 2.0, 0.5), origin=(0.0, 0.0, 4.0)
+    )
+    ground = jl.Ground(reflectance=0.3)
+    x, y = (a.ravel() for a in np.meshgrid(np.arange(1.0, 21.0), np.arange(2.5, 12.5)))
+    # Beams travel to the east, and are within the map above their places on the ground.
+    x = x + (17.0 if zenith == 60.0 else 4.0)
+    lidar = jl.Lidar(altitude=100.0, divergence=2.0, pulse=jl.GaussianPulse(fwhm=1.0))
+    survey = jl.Survey(lidar, np.stack([x, y], axis=1), zenith=zenith, azimuth=90.0)
+
+    def simulated(survey, rtol, **scene):
+        return jl.simulate_many(survey, jl.Scene(ground=ground, **scene), key=KEY, rtol=rtol, max_orders=1)
+
+    middle = survey.subset(np.array([95]))
+    one_way, two_ways = (
+        simulated(middle, 0.003, canopy=jl.Canopy(voxels, leaf=LEAF, hotspot=hotspot))
+        for hotspot in (True, False)
+    )
+    shots = simulated(survey, 0.1, meshes=[leaves_of(voxels)])
+    # Records of leaves, which reach out of their voxels, are longer.
+    times = np.intersect1d(shots.time.round(3), one_way.time.round(3))
+    wave = shots.reflectance[:, 0, np.isin(shots.time.round(3), times)].astype(float)
+    one_way, two_ways = (
+        many.reflectance[0, 0, np.isin(many.time.round(3), times)] for many in (one_way, two_ways)
+    )
+    is_lit = one_way > 0.01 * one_way.max()
+    mean, stderr = wave.mean(axis=0)[is_lit], wave.std(axis=0)[is_lit] / np.sqrt(len(wave))
+    assert is_lit.sum() > 10
+    assert np.abs((mean - one_way[is_lit]) / stderr).max() < SIGMAS
+    assert np.abs((mean - two_ways[is_lit]) / stderr).max() > 1.5 * SIGMAS
+
+
 # -- refused input -----------------------------------------------------------------------------------------
 
 
