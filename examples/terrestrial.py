@@ -1,9 +1,10 @@
 """Scan a tree from a tripod. Run it as `python examples/terrestrial.py [--step 1] [--out figures]`.
 
 A RIEGL VZ-400 stands 14 m from the paper's tree (Table 2) and turns about a vertical axis, with an angular
-step that is coarser than the instrument's. Its returns are drawn as the scanner sees them and from the side.
-By height, the share of its returns from leaves is set beside the share of leaf area: one scan sees less of
-the upper crown, which the lower one hides.
+step that is coarser than the instrument's. Leaves and branches are triangles: beams hit them or pass between
+them. Its returns are drawn as the scanner sees them and from the side. By height, the share of its returns
+from leaves is set beside the share of leaf area: one scan sees less of the upper crown, which the lower one
+hides.
 """
 
 import argparse
@@ -24,17 +25,19 @@ from jaxlidar.io import atomic_write
 
 # Position of the scanner, m: 14 m south of the stem.
 SENSOR = np.array([0.0, -14.0, 1.7])
-VOXEL_SIZE, LEAF_AREA = 0.25, 0.004
-LAYER = 1.0
+# A leaf for each bud, m2, and the height of layers, m.
+LEAF_AREA, LAYER = 0.004, 1.0
 # Range up to which the figure goes, m.
 REACH = 25.0
 
 
-def tree_scene() -> tuple[jl.Scene, jl.VoxelMap]:
-    """Return the tree over level ground, and its voxel map."""
-    voxels = jl.voxelise(jl.grow(jl.broadleaf(), seed=0), VOXEL_SIZE, leaf_area=LEAF_AREA, wood="surface")
-    canopy = jl.Canopy(voxels, leaf=jl.Prospect(), bark=jl.spectrum("bark-oak"))
-    return jl.Scene(canopy=canopy, ground=jl.Ground(reflectance=jl.spectrum("soil-medium"))), voxels
+def tree_scene() -> tuple[jl.Scene, jl.MeshSurface]:
+    """Return the tree over level ground, and its leaves."""
+    tree = jl.grow(jl.broadleaf(), seed=0)
+    leaves = jl.leaf_mesh(tree, LEAF_AREA, key=jax.random.key(1))
+    wood = jl.MeshSurface(jl.mesh_of(tree, leaves=0), {"wood": jl.spectrum("bark-oak")})
+    ground = jl.Ground(reflectance=jl.spectrum("soil-medium"))
+    return jl.Scene(meshes=(wood, leaves), ground=ground), leaves
 
 
 def scan(step: float) -> jl.Survey:
@@ -47,19 +50,19 @@ def scan(step: float) -> jl.Survey:
     return jl.Survey(lidar, sensor=sensor, zenith=90.0 + elevation, azimuth=azimuth)
 
 
-def profiles(returns: jl.DiscreteReturns, voxels: jl.VoxelMap) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def profiles(
+    returns: jl.DiscreteReturns, leaves: jl.MeshSurface
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the edges of layers, m, and the shares of returns from leaves and of leaf area in each."""
-    assert voxels.leaf is not None
-    leaf = np.asarray(voxels.leaf, float).sum(axis=(0, 1))
-    z = float(voxels.origin[2]) + VOXEL_SIZE * (np.arange(leaf.size) + 0.5)
+    z = leaves.corners()[:, :, 2].mean(axis=1)
     edges = np.arange(0.0, z.max() + LAYER, LAYER)
-    is_leaf = returns.material == "leaf"
-    seen = np.histogram(returns.position[is_leaf, 2], edges)[0]
-    present = np.histogram(z, edges, weights=leaf)[0]
+    # All triangles have the same area.
+    present = np.histogram(z, edges)[0]
+    seen = np.histogram(returns.position[returns.material == "mesh:leaf", 2], edges)[0]
     return edges, seen / seen.sum(), present / present.sum()
 
 
-def draw(survey: jl.Survey, returns: jl.DiscreteReturns, voxels: jl.VoxelMap, step: float) -> Figure:
+def draw(survey: jl.Survey, returns: jl.DiscreteReturns, leaves: jl.MeshSurface, step: float) -> Figure:
     """Draw the view of the scanner, the points from the side, and the profiles."""
     figure = plt.figure(figsize=(12.5, 4.3), layout="constrained")
     view, side, profile = figure.subplots(1, 3, width_ratios=(1.1, 1.0, 0.75))
@@ -73,8 +76,9 @@ def draw(survey: jl.Survey, returns: jl.DiscreteReturns, voxels: jl.VoxelMap, st
     image = view.pcolormesh(azimuth, elevation, distance, cmap="viridis_r", vmax=REACH, rasterized=True)
     figure.colorbar(image, ax=view, label="range of the first return (m)", extend="max")
     view.set(title="as the scanner sees it", xlabel="azimuth (degrees)", ylabel="elevation (degrees)")
-    for material, colour in (("ground", "#8c6d46"), ("leaf", "#009E73"), ("bark", "#3b2a1a")):
-        _, y, z = returns.position[returns.material == material].T
+    for material, colour in (("ground", "#8c6d46"), ("leaf", "#009E73"), ("wood", "#3b2a1a")):
+        is_material = np.char.endswith(returns.material.astype(str), material)
+        _, y, z = returns.position[is_material].T
         side.scatter(
             y - SENSOR[1], z, s=5.0 * step, color=colour, linewidths=0, label=material, rasterized=True
         )
@@ -82,7 +86,7 @@ def draw(survey: jl.Survey, returns: jl.DiscreteReturns, voxels: jl.VoxelMap, st
     side.set(title="from the side", xlabel="distance to the north (m)", ylabel="height (m)", aspect="equal")
     side.set(xlim=(-1.0, REACH), ylim=(-0.5, 22.5))
     side.legend(frameon=False, fontsize=8, loc="upper left", ncols=2)
-    edges, seen, present = profiles(returns, voxels)
+    edges, seen, present = profiles(returns, leaves)
     profile.stairs(present, edges, orientation="horizontal", label="leaf area", color="k")
     profile.stairs(seen, edges, orientation="horizontal", label="returns from leaves", color="#009E73")
     profile.set(title="what one scan sees", xlabel="share of the tree in each metre", ylabel="height (m)")
@@ -96,17 +100,20 @@ def main(arguments: Sequence[str] | None = None) -> jl.DiscreteReturns:
     parser.add_argument("--step", type=float, default=1.0, help="angular step, degrees")
     parser.add_argument("--out", type=Path, default=Path("."), help="folder of the figure")
     options = parser.parse_args(arguments)
-    scene, voxels = tree_scene()
+    scene, leaves = tree_scene()
     survey = scan(options.step)
     many = jl.simulate_many(survey, scene, key=jax.random.key(0), rtol=0.1, max_orders=1, truth=True)
     returns = many.returns()
-    edges, seen, present = profiles(returns, voxels)
+    edges, seen, present = profiles(returns, leaves)
     middle = 0.5 * (edges[1:] + edges[:-1])
     print(returns)
+    upwards = np.asarray(survey.zenith) > 90.0
+    without = np.setdiff1d(np.flatnonzero(upwards), returns.shot)
+    print(f"{without.size} of {upwards.sum()} shots above the horizon have no return")
     print(f"mean height of leaf area {present @ middle:.1f} m, of returns from leaves {seen @ middle:.1f} m")
     options.out.mkdir(parents=True, exist_ok=True)
     with atomic_write(options.out / "terrestrial.png") as draft:
-        draw(survey, returns, voxels, options.step).savefig(draft, dpi=80, format="png")
+        draw(survey, returns, leaves, options.step).savefig(draft, dpi=80, format="png")
     return returns
 
 

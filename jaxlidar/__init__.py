@@ -46,7 +46,7 @@ waveforms is in the package `inversion`.
 
 `Habit`, `Branching`, `broadleaf`, `conifer`, `shrub`, `spreading_tree`, `grow`, `forest`,
 `stand_of_leaf_area`, `stand_from_inventory`, `Stand`, `Tree`, `LSystem`, `Rule`, `turtle`, `voxelise`,
-`voxelise_points`, `canopy_from_points`, `voxelise_mesh`, `Mesh`, `mesh_of`.
+`voxelise_points`, `canopy_from_points`, `voxelise_mesh`, `Mesh`, `mesh_of`, `leaf_mesh`.
 
 ## Sunlight
 
@@ -100,6 +100,7 @@ from jaxlidar.planning.setup import make_setup
 from jaxlidar.plants.forest import forest, stand_of_leaf_area
 from jaxlidar.plants.habits import Branching, Habit, broadleaf, conifer, grow, shrub, spreading_tree
 from jaxlidar.plants.inventory import stand_from_inventory
+from jaxlidar.plants.leaf_mesh import leaf_mesh
 from jaxlidar.plants.lsystem import LSystem, Rule
 from jaxlidar.plants.meshes import Mesh, SolidMeshWarning, mesh_of, voxelise_mesh
 from jaxlidar.plants.point_canopy import canopy_from_points
@@ -240,6 +241,7 @@ __all__ = [
     "voxelise_mesh",
     "Mesh",
     "mesh_of",
+    "leaf_mesh",
     # Sunlight.
     "reflectance_factor",
     "plan_reflectance",

@@ -35,6 +35,8 @@ from jaxlidar.plants.grid import Grid, voxel_edges
 from jaxlidar.plants.tree import Tree
 from jaxlidar.scenes.voxels import VoxelMap
 
+# Outlines of leaves: regular polygons, by the number of their corners and their width over their length.
+LEAF_OUTLINES = {"rhombus": (4, 0.5), "ellipse": (8, 0.5), "needle": (3, 0.05)}
 # Largest number of pieces in memory at a time, by an upper bound on their number.
 _MAX_PIECES = 1_000_000
 # Share of edges that two triangles have in common from which a surface counts as closed.
@@ -231,16 +233,47 @@ def _leaves(
 ) -> Float[np.ndarray, "triangles 3 3"]:
     """Return the triangles of `count` leaves in each clump."""
     random = np.random.default_rng(seed)
-    n_leaves = count * len(tree.bud_position)
-    # Uniform within a sphere: directions from a normal distribution, radii as cube roots.
-    places, normals = random.normal(size=(2, n_leaves, 3))
-    places, normals = (v / np.linalg.norm(v, axis=1, keepdims=True) for v in (places, normals))
-    radius = np.cbrt(random.uniform(size=n_leaves)) * np.repeat(tree.bud_radius, count)
-    centre = np.repeat(tree.bud_position, count, axis=0) + radius[:, None] * places
-    along, across = _frames(normals)
-    tip, side = 0.5 * length * along, 0.25 * length * across
-    halves = [(centre - tip, centre + side, centre + tip), (centre - tip, centre + tip, centre - side)]
-    return np.concatenate([np.stack(t, axis=1) for t in halves])
+    centre = points_in_clumps(tree, np.full(len(tree.bud_radius), count), random)
+    normals = random.normal(size=centre.shape)
+    along, across = _frames(normals / np.linalg.norm(normals, axis=1, keepdims=True))
+    corners = leaf_corners(centre, along, across, 0.25 * length**2, "rhombus")
+    return corners[:, leaf_faces(4)].reshape(-1, 3, 3)
+
+
+def points_in_clumps(
+    tree: Tree, counts: Int[np.ndarray, " clumps"], random: np.random.Generator
+) -> Float[np.ndarray, "points 3"]:
+    """Draw points that are uniform within the leaf clumps of a tree: `counts` in each, clump by clump."""
+    clump = np.repeat(np.arange(len(counts)), counts)
+    # Directions from a normal distribution, radii as cube roots.
+    direction = random.normal(size=(len(clump), 3))
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    radius = np.cbrt(random.uniform(size=len(clump))) * tree.bud_radius[clump]
+    return tree.bud_position[clump] + radius[:, None] * direction
+
+
+def leaf_corners(
+    centre: Float[np.ndarray, "n 3"],
+    along: Float[np.ndarray, "n 3"],
+    across: Float[np.ndarray, "n 3"],
+    area: float,
+    shape: str,
+) -> Float[np.ndarray, "n corners 3"]:
+    """Return the corners of leaves of a one-sided `area`, m2, and a shape of `LEAF_OUTLINES`.
+
+    `along`, `across`: unit vectors of the axis and of the width.
+    """
+    n_corners, width = LEAF_OUTLINES[shape]
+    turns = 2.0 * np.pi * np.arange(n_corners) / n_corners
+    # The area of a regular polygon over its squared radius.
+    radius = np.sqrt(area / (0.5 * n_corners * np.sin(turns[1]) * width))
+    steps = radius * np.stack([np.cos(turns), width * np.sin(turns)])[:, None, :, None]
+    return centre[:, None] + steps[0] * along[:, None] + steps[1] * across[:, None]
+
+
+def leaf_faces(n_corners: int) -> Int[np.ndarray, "triangles 3"]:
+    """Return the triangles of a convex polygon, as numbers of its corners."""
+    return np.array([(0, k, k + 1) for k in range(1, n_corners - 1)])
 
 
 def _closed_share(mesh: Mesh, selected: Bool[np.ndarray, " n"]) -> float:

@@ -36,6 +36,13 @@ def _as_tuple(x: Any) -> Any:
     return tuple(x) if isinstance(x, Iterable) else x
 
 
+def _as_meshes(x: Any) -> Any:
+    """Convert to a tuple. Tuples in it, such as `leaf_mesh` gives of a stand, are taken apart."""
+    if not isinstance(x, Iterable):
+        return x
+    return tuple(itertools.chain(*(mesh if isinstance(mesh, tuple) else (mesh,) for mesh in x)))
+
+
 @final
 class Scene(eqx.Module):
     """A scene: the canopy, plates, ground, atmosphere and meshes that a lidar observes.
@@ -48,9 +55,10 @@ class Scene(eqx.Module):
     - `plates`: a sequence of `Plate`, or of other `AbstractSheet`. Default ().
     - `ground`: a `Ground`, a `Terrain`, another `AbstractGround`, or None. Default None.
     - `atmosphere`: an `Atmosphere`, or None. Default None.
-    - `meshes`: a sequence of `MeshSurface`. Triangles that lie in the ground are met before it; of triangles
-      in one plane, those of the mesh that comes first in the sequence. Beside a canopy or terrain with
-      periodic sides, meshes repeat with it; one that crosses a side enters by the opposite one. Default ().
+    - `meshes`: a sequence of `MeshSurface`, or of tuples of them. Triangles that lie in the ground are met
+      before it; of triangles in one plane, those of the mesh that comes first in the sequence. Beside a
+      canopy or terrain with periodic sides, meshes repeat with it; one that crosses a side enters by the
+      opposite one. Default ().
 
     **Raises:** TypeError for an argument of the wrong type; ValueError for a plate in the plane of the
     ground, of another plate, of a triangle or of a cell of the terrain, for a canopy with periodic sides
@@ -73,7 +81,7 @@ class Scene(eqx.Module):
     plates: tuple[AbstractSheet, ...] = eqx.field(converter=_as_tuple, default=())
     ground: AbstractGround | None = None
     atmosphere: Atmosphere | None = None
-    meshes: tuple[MeshSurface, ...] = eqx.field(converter=_as_tuple, default=())
+    meshes: tuple[MeshSurface, ...] = eqx.field(converter=_as_meshes, default=())
 
     ranges: ClassVar = {"gap": Range(MIN_GAP)}
 

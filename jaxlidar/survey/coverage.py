@@ -218,6 +218,18 @@ def is_cut_off(canopy: Canopy) -> bool:
     return False
 
 
+def beams_are_narrow(survey: Survey, canopy: Canopy | None) -> bool:
+    """Return True if the beams of all shots are narrower than a voxel, about the middle of its map."""
+    if canopy is None:
+        return False
+    voxels, diameter = canopy.voxels, 2.0 * survey.footprint_radius
+    if survey.has_sensor_position:
+        # The footprint is that 1 m ahead of the sensor.
+        middle = 0.5 * (np.asarray(voxels.origin, float) + np.asarray(voxels.top, float))
+        diameter = diameter * np.linalg.norm(middle - survey.position, axis=1)
+    return bool(np.max(diameter) < np.min(np.asarray(voxels.voxel_size)))
+
+
 def off_map_message(fractions: Float[np.ndarray, " shots"]) -> str | None:
     """Return a sentence on the footprints that lie partly outside the map, or None where there are none."""
     shots = np.flatnonzero(fractions >= NOTABLE_FRACTION)

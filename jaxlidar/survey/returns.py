@@ -109,6 +109,8 @@ _GROUND_CLASS, _UNCLASSIFIED, _LOW_VEGETATION, _LOW_NOISE, _HIGH_NOISE = 2, 1, 3
 # Intensity, of 16 bits, of an apparent reflectance of one.
 _FULL_INTENSITY = 65535
 _ORDERS = ("first", "higher")
+# Materials of plants: of voxels, and of the triangles of `leaf_mesh` and `mesh_of`.
+_PLANTS = ("leaf", "bark", "mesh:leaf", "mesh:wood")
 
 
 @final
@@ -174,15 +176,16 @@ class DiscreteReturns(eqx.Module):
     def classification(self) -> Int[np.ndarray, " returns"]:
         """Classes of the LAS specification, (returns,), by the true material.
 
-        2 ground; 3, 4 and 5 leaf and bark up to 0.5 m, up to 2 m and higher above the ground (5 also where
-        there is none); 1 plates; 18 air; 7 noise.
+        2 ground; 3, 4 and 5 leaf and bark, of voxels or as `leaf_mesh` and `mesh_of` make them, up to 0.5 m,
+        up to 2 m and higher above the ground (5 also where there is none); 1 plates and other meshes; 18 air;
+        7 noise.
         """
         height = self.position[:, 2] - self.ground_height
         # Comparisons with NaN are false: without ground, vegetation is high.
         vegetation = np.full(len(self), _LOW_VEGETATION + len(_VEGETATION_LIMITS))
         for number, limit in reversed(list(enumerate(_VEGETATION_LIMITS))):
             vegetation[height <= limit] = _LOW_VEGETATION + number
-        classes = np.where(np.isin(self.material, ("leaf", "bark")), vegetation, _UNCLASSIFIED)
+        classes = np.where(np.isin(self.material, _PLANTS), vegetation, _UNCLASSIFIED)
         for name, number in (("ground", _GROUND_CLASS), ("air", _HIGH_NOISE), (_NO_MATERIAL, _LOW_NOISE)):
             classes[self.material == name] = number
         return classes
@@ -376,6 +379,21 @@ def input_of_waveforms(waves: Any, wavelength: Any) -> DetectorInput:
         receiver_noise=float(waves.acquisition.noise[w]),
         ground_height=np.asarray(waves.ground_height, float),
     )
+
+
+def warn_of_expected_returns(waves: DetectorInput) -> None:
+    """Warn of shots that see crowns of voxels and nothing else; see `Waveforms.returns`."""
+    n_shots = 0
+    for shots in waves.chunks:
+        light = {name: np.asarray(a[shots]).sum(axis=1) for name, a in waves.components.items()}
+        crowns = light.get("leaf", 0.0) + light.get("bark", 0.0)
+        n_shots += np.count_nonzero((crowns > 0.0) & (crowns >= sum(light.values())))
+    if n_shots:
+        warn_user(
+            f"{n_shots} of {len(waves)} shots see crowns alone, by beams narrower than voxels: their returns "
+            "are of the light that is expected of leaves, so that hardly any shot has none; leaf_mesh makes "
+            "leaves that are hit or missed"
+        )
 
 
 def input_of_waveform(wave: Any, lidar: Any, wavelength: Any) -> DetectorInput:

@@ -41,7 +41,14 @@ from jaxlidar.sensors.survey import Survey
 from jaxlidar.survey.acquisition import acquisition_of
 from jaxlidar.survey.choose_strategy import choose_strategy
 from jaxlidar.survey.collect import StoredSurvey, SurveyResults, waveforms_in_memory
-from jaxlidar.survey.coverage import OffMapWarning, ground_heights, is_cut_off, off_map, off_map_message
+from jaxlidar.survey.coverage import (
+    OffMapWarning,
+    beams_are_narrow,
+    ground_heights,
+    is_cut_off,
+    off_map,
+    off_map_message,
+)
 from jaxlidar.survey.results import OPTIONAL_ARRAYS
 from jaxlidar.survey.tiled_scene import TiledSceneStrategy
 from jaxlidar.survey.truths import StrategyWithTruth
@@ -186,7 +193,8 @@ def simulate_many(
         "acquisition": acquisition_of(survey),
     }
     run_tasks = functools.partial(outcomes, executor=executor, devices=devices)
-    info: dict[str, Any] = {"automatic orders": max_orders is None}
+    is_narrow = isinstance(scene, Scene) and beams_are_narrow(survey, scene.canopy)
+    info: dict[str, Any] = {"automatic orders": max_orders is None, "narrow beams": is_narrow}
     if path is None:
         results = SurveyResults.in_memory(strategy)
         _trace(results, key, run_tasks, progress)

@@ -38,6 +38,7 @@ from jaxlidar.survey.returns import (
     input_of_waveforms,
     returns_of,
     true_returns_of,
+    warn_of_expected_returns,
     wavelength_index,
 )
 
@@ -67,12 +68,12 @@ class Waveforms(eqx.Module):
     - `error`: (shots,) relative error, as `simulate` defines it. `photons`: (shots,) number traced.
     - `truth`: a `Truth` with an axis of shots, what each beam meets in the scene; None unless asked for.
     - `acquisition`: an `Acquisition`, what else discrete returns need; None for files of earlier versions.
-    - `info`: dict of "rtol", "orders" followed, "automatic orders" (False where
-      `max_orders` was given), "altitude" of the lidar in m (None for sensors), "seconds" that it took, and
-      whether light was "shared" (over `SceneParts`: in all tiles). Over one scene with shared light, also the
-      spacing in m of the "grid" of nodes at which it entered, and a bound on the fraction of samples that
-      "parallel light" changes. Over `SceneParts`, also the number of "parts", the "margin" in m around tiles,
-      and the "margin of all light", which loses none.
+    - `info`: dict of "rtol", "orders" followed, "automatic orders" (False where `max_orders` was given),
+      "narrow beams" (True where all are narrower than a voxel), "altitude" of the lidar in m (None for
+      sensors), "seconds" that it took, and whether light was "shared" (over `SceneParts`: in all tiles). Over
+      one scene with shared light, also the spacing in m of the "grid" of nodes at which it entered, and a
+      bound on the fraction of samples that "parallel light" changes. Over `SceneParts`, also the number of
+      "parts", the "margin" in m around tiles, and the "margin of all light", which loses none.
 
     **Example:**
 
@@ -230,6 +231,10 @@ class Waveforms(eqx.Module):
         smooth one leaves a flat target across the beam an error of range of at most some per cent of a
         sample.
 
+        Over voxels, waveforms are those of the expected light of leaves, so that nearly every shot has a
+        return from every crown: counts of returns, and of shots without one, are those of a scanner over
+        leaves that are hit or missed, which `leaf_mesh` makes. Positions and energies hold for both.
+
         **Arguments:**
 
         - `detector`: "peak", "constant fraction" or "leading edge"; or "decomposition" into echoes of the
@@ -259,7 +264,8 @@ class Waveforms(eqx.Module):
         **Returns:** a `DiscreteReturns`.
 
         **Warns:** UserWarning for a `record` whose receiver cuts noise at zero, as one without `background`
-        does: its noise is estimated from the samples above zero.
+        does: its noise is estimated from the samples above zero; and for shots by beams narrower than a voxel
+        that see leaf or bark of voxels and nothing else: their counts are of expected light.
 
         **Raises:** ValueError for arguments outside their ranges or of other shapes, for waveforms of a
         file of an earlier version, and for times that a function gives outside of the record or in another
@@ -275,6 +281,9 @@ class Waveforms(eqx.Module):
         ['plate', 'ground'] [6. 0.] [525.7  532.09]
         """
         waves = input_of_waveforms(self, wavelength)
+        # Files of earlier versions do not say how wide beams are.
+        if self.info.get("narrow beams", False):
+            warn_of_expected_returns(waves)
         if record is not None:
             record = _at_wavelength(record, self.wavelength, wavelength)
         return returns_of(
