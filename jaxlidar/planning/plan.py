@@ -19,6 +19,7 @@ from jaxlidar._fields.checks import (
     concrete_number,
 )
 from jaxlidar._jax.memory import format_bytes
+from jaxlidar._registry import survey_lines
 from jaxlidar.optics.laws import AbstractMirror
 from jaxlidar.planning.channels import (
     ScattererChannels,
@@ -117,9 +118,10 @@ class PlanScope(eqx.Module):
 
 @dataclasses.dataclass(frozen=True)
 class _EffectTable:
-    """The rows of a plan's table. All tables are equal: no compiled program depends on one."""
+    """The rows of a plan's table, and lines on its survey. All are equal: no program depends on them."""
 
     rows: tuple[Effect, ...] = dataclasses.field(compare=False)
+    survey_lines: tuple[str, ...] = dataclasses.field(compare=False, default=())
 
 
 @final
@@ -255,7 +257,7 @@ class Plan(eqx.Module):
         one_column, two_columns = (self.jacobian_memory(n) for n in (1, 2))
         memory = f"about {format_bytes(self.memory)} of memory; a Jacobian in one geometric unknown "
         memory += f"{format_bytes(one_column)}, in each more {format_bytes(two_columns - one_column)}"
-        return "\n".join([*lines, sizes, memory])
+        return "\n".join([*lines, sizes, memory, *self.table.survey_lines])
 
 
 def plan(
@@ -284,7 +286,8 @@ def plan(
     **Arguments:**
 
     - `lidar`: a `Lidar`; or a `Survey`: the plan then serves all of its shots; its table is that of a shot
-      in their middle with the largest zenith.
+      in their middle with the largest zenith, followed by how `simulate_many` would trace the survey, what a
+      shot takes, and the size of the results.
     - `scene`: a `Scene`.
     - `rtol`: relative accuracy aimed at, in (0, 1); sets how many orders are worth following, and for how
       long. Default None: 0.01.
@@ -351,7 +354,7 @@ def plan(
         check_range("max_memory", max_memory, 0.0, low_open=True)
     check_choice("footprint", footprint, ("random", "fixed"))
     check_kind("histories", histories, bool | None, "True, False or None")
-    shots = lidar if survey is None else survey
+    shots, scene_of_map = lidar if survey is None else survey, scene
     check_footprints_on_terrain(shots, scene)
     check_scene_near_beams(shots, scene)
     air = scene.atmosphere
@@ -500,7 +503,7 @@ def plan(
     check_memory(memory, limit)
     # Fits may ask for more orders later: the scope says how many there would be memory for.
     possible_orders = range(max(order_choice.affordable_orders, orders), orders - 1, -1)
-    table = ()
+    table, on_survey = (), ()
     if describe:
         # With all effects: a row also says what an effect that is off would change.
         table = effect_table(
@@ -512,6 +515,8 @@ def plan(
             path_lengths.start_distance,
             records_all_of_order_one=window is None,
         )
+        if isinstance(shots, Survey):
+            on_survey = survey_lines(shots, scene_of_map, rtol, max_orders)
         if survey is not None and beams_are_parallel(survey):
             bound = parallel_light_bound(survey, path_lengths.start_distance, last_return)
             reason = "neglected where footprints share light"
@@ -547,7 +552,7 @@ def plan(
             max_memory=max_memory,
         ),
         memory=memory,
-        table=_EffectTable(table),
+        table=_EffectTable(table, on_survey),
     )
 
 

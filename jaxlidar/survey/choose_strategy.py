@@ -2,10 +2,13 @@
 
 import math
 
+import jax.numpy as jnp
 import numpy as np
 
 from jaxlidar._constants import SPEED_OF_LIGHT
 from jaxlidar._fields.checks import concrete_array, concrete_number
+from jaxlidar._jax.memory import format_bytes
+from jaxlidar._registry import survey_lines
 from jaxlidar._text import percent
 from jaxlidar.optics.laws import AbstractMirror
 from jaxlidar.planning.local_origin import move_aim_to_origin
@@ -20,7 +23,7 @@ from jaxlidar.sensors.survey import Survey
 from jaxlidar.survey.footprint_splines import FootprintSplines, fit_footprints
 from jaxlidar.survey.node_groups import IlluminatedNodes, NodeGroup, illuminated_nodes, make_groups
 from jaxlidar.survey.per_shot import MAX_WAVELENGTHS_OF_NARROW, PerShotStrategy
-from jaxlidar.survey.results import OPTIONAL_ARRAYS
+from jaxlidar.survey.results import OPTIONAL_ARRAYS, SAMPLED_ARRAYS
 from jaxlidar.survey.shared_illumination import SharedIlluminationStrategy
 from jaxlidar.survey.strategy import AbstractStrategy
 from jaxlidar.survey.view_geometry import ViewGeometry
@@ -89,6 +92,37 @@ def choose_strategy(
         return strategy
     resolves_edges = _resolves_edges(plan, columns, survey, scene)
     return PerShotStrategy(setup, relative_survey, rtol, kept_names, resolves_edges)
+
+
+@survey_lines.register
+def describe_strategy(survey: Survey, scene: Scene, rtol: float, max_orders: int | None) -> tuple[str, ...]:
+    """Return lines on how a survey would be traced: the strategy, the work for a shot, and what results take.
+
+    Where one setting makes shots far dearer than another one would, they say which.
+    """
+    try:
+        strategy = choose_strategy(survey, scene, rtol, max_orders, shared=None)
+    except ValueError as error:
+        return (f"simulate_many refuses this survey: {error}",)
+    plan, notes = strategy.setup.plan, []
+    if isinstance(strategy, SharedIlluminationStrategy):
+        n_nodes = sum(len(group.node_position) for group in strategy.groups)
+        how = f"their light is shared, on {n_nodes:,} nodes of a grid"
+    else:
+        how = f"each is traced apart, in eight batches or more of {plan.n_rays} rays"
+        reason = reason_against_sharing(strategy.survey, strategy.setup, rtol)
+        notes = [f"light is not shared: {reason or 'that would save no time, as few footprints overlap'}"]
+        if plan.orders > 1:
+            how += f" and {plan.photons_traced} photons, through {plan.orders} orders"
+            notes.append("photons take most of the time: one order (max_orders=1) takes rays alone")
+    # Of each array with samples a row a wavelength; components are those of two orders and of materials.
+    n_rows = (len(SAMPLED_ARRAYS) + 1 + len(plan.config.materials)) * survey.lidar.wavelength.size
+    n_bytes = jnp.result_type(float).itemsize * n_rows * plan.n_samples
+    total = format_bytes(n_bytes * len(survey))
+    size = (
+        f"results: about {format_bytes(n_bytes)} a shot, {total} for all (keep= and path= take less memory)"
+    )
+    return (f"simulate_many: {len(survey):,} shots; {how}", *notes, size)
 
 
 def _columns_of_footprint(plan: Plan, survey: Survey, scene: Scene) -> float:
