@@ -28,8 +28,8 @@ CLASSES = {
     }.items()
     if inspect.isclass(value) and not inspect.isabstract(value)
 }
-# A handle of this process: what it switches on is no content.
-del CLASSES["jaxlidar.CompilationCache"]
+# Handles of this process: what one switches on, and the file that the other writes, are no content.
+del CLASSES["jaxlidar.CompilationCache"], CLASSES["jaxlidar.io.LasWriter"]
 LIDAR, SCENE = jl.Lidar(), jl.Scene(ground=jl.Ground(reflectance=jl.spectrum("soil-medium")))
 VOXELS = jl.VoxelMap.from_lad(np.ones((1, 1, 2)), voxel_size=1.0, leaf_angles="planophile")
 

@@ -582,9 +582,16 @@ def _plan(
     cases = [(dataclasses.replace(end, **fixed_fields), scene) for end in ends for scene in scenes]
     if "sampling_interval" in free_values.paths:
         shortest = dataclasses.replace(ends[0], wavelength=lidar.wavelength)
-        finest = plan_cases([(shortest, scene) for scene in scenes], window=None, **options)
+        finest = _plan_of_limits([(shortest, scene) for scene in scenes], **options)
         options["bin_width"] = finest.bins.width
-    return plan_cases(cases, window=None, **options)
+    return _plan_of_limits(cases, **options)
+
+
+def _plan_of_limits(cases: list[tuple[Lidar, Scene]], **options: Any) -> Plan:
+    try:
+        return plan_cases(cases, window=None, **options)
+    except ValueError as error:
+        raise ValueError(f"at the limits a lidar or a scene is inadmissible: {error}") from error
 
 
 def _number_of_samples(plan: Plan, free_values: FreeValues) -> int | None:

@@ -6,6 +6,7 @@ suffices for quantities that are monotonic in each unknown, such as heights and 
 not all corners are examined (`corner_cases`).
 """
 
+import dataclasses
 import itertools
 from typing import Any
 
@@ -124,9 +125,12 @@ def plan_for_bounds(
         first = _plan_with_histories(first, start_lidar, start_scene, **start_options)
     common.update(max_orders=first.orders, histories=first.config.keeps_histories)
     try:
-        return plan_cases(cases, survey=survey, **common)
+        plan = plan_cases(cases, survey=survey, **common)
     except ValueError as error:
         raise ValueError(f"at the bounds of the unknowns the scene is inadmissible: {error}") from error
+    # The orders are those that the start calls for: the plan must refuse scenes that call for more.
+    scope = dataclasses.replace(plan.scope, automatic_orders=first.scope.automatic_orders)
+    return dataclasses.replace(plan, scope=scope)
 
 
 def _plan_with_histories(first: Plan, lidar: Lidar, scene: Scene, **options: Any) -> Plan:

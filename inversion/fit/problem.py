@@ -122,14 +122,13 @@ class Problem(eqx.Module):
       the median), 0 to 1, that replaces any smaller `noise`: a record without noise would give bins that no
       photon reached, where the simulation's standard error is zero, infinite weight. Default 1e-3.
     - `plan`: what to simulate (`jaxlidar.plan`, with the window of `observed`, valid throughout the bounds),
-      one for all records. Derivatives are computed in
-      groups if all at once would take more memory than its `max_memory`. Default None: planned for the first
-      lidar and scene and the corners of the bounds.
+      one for all records. Derivatives are computed in groups if all at once would take more memory than its
+      `max_memory`. Default None: planned for the first lidar and scene and the corners of the bounds.
     - `n_photons`: photons of one simulation, all eight batches together, at least 8. Default None: 65536, or
       those of `plan`.
     - `n_rays`: rays that sample the footprint in each of the eight batches, at least 1. Default None: 1024,
       or those of `plan`.
-    - `max_orders`: follow light for this many scatterings. Default None: by the albedos of the start.
+    - `max_orders`: follow light for this many scatterings. Default None: as many as the start needs.
 
     **Raises:** ValueError for inadmissible arguments, among them a start outside its bounds, samples that do
     not fit the lidar or the plan, a plan that does not serve all scenes within the bounds or that is given

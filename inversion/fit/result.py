@@ -107,7 +107,7 @@ class Retrieval(AbstractPosterior):
     history: tuple[float, ...] = eqx.field(static=True, default=())
 
     @property
-    def correlation(self) -> Float[Array, "*footprints n n"]:
+    def correlation(self) -> Float[Array | np.ndarray, "*footprints n n"]:
         """Correlation of the flattened unknowns, (n, n)."""
         return correlation_of(self.covariance)
 

@@ -67,8 +67,6 @@ from jaxtyping import Bool, Float, Int
 _MIN_EIGENVALUE = 1e-6
 # An unknown with more than this squared component in an undetermined combination is undetermined.
 _MIN_COMPONENT = 1e-3
-# Smallest singular value, relative to columns of unit length, that counts in the Newton decrement.
-_MIN_SINGULAR_VALUE = 1e-3
 # Grids of phi and k^2.
 _PHI_GRID = (0.0, 0.5, 0.8, 0.92, 0.97)
 _K2_GRID = (0.0, 0.3, 1.0, 3.0, 10.0, 30.0, 100.0, 300.0, 1000.0, 3000.0)

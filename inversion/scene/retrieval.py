@@ -184,7 +184,8 @@ def retrieve_scene(
     - `kernels`: by name of unknown, indices of values for which rows of the averaging kernel are computed,
       such as `{"leaf": [(5, 5, 3)]}`; each takes as long as a draw. Default None: none.
     - `plan`: a `Plan` for the survey. Default None: made here, for the bounds of the unknowns.
-    - `max_orders`: follow light for this many scatterings, at least 1. Default None: as the albedos ask for.
+    - `max_orders`: follow light for this many scatterings, at least 1. Default None: as many as the
+      start needs.
     - `n_rays`, `n_photons`: rays and photons of the simulation of a shot, which is one batch. Default None: a
       ray for each column of voxels in a footprint, within 32 and 512; 2048 photons.
     - `path`: a Zarr store, whose name ends in ".zarr". A run that was interrupted goes on from its last step,

@@ -266,10 +266,13 @@ class LasWriter:
         self._writer: Any = None
 
     def __enter__(self) -> "LasWriter":
+        if self._header is not None:
+            raise ValueError(f"{self.path} is written; admissible is another LasWriter")
         self._draft = self._files.enter_context(atomic_write(self.path))
         return self
 
     def __exit__(self, *error: Any) -> None:
+        self._draft = None
         if error[0] is None and self._writer is None:
             missing = ValueError(f"{self.path}: no part has a point; admissible is one point or more")
             self._files.__exit__(type(missing), missing, None)
@@ -313,8 +316,9 @@ class LasWriter:
         points = las_points(_FORMAT_6, coordinates, fields, self._system, extra or {}, offset=offset)
         if self._header is None:
             self._header, self._writer = points.header, self._open(self._draft, points.header)
-        if self._header.point_format != points.header.point_format:
-            raise ValueError("extra has other names than in the first part; admissible are the same in all")
+        first, names = (list(h.point_format.extra_dimension_names) for h in (self._header, points.header))
+        if first != names:
+            raise ValueError(f"extra has {names}; admissible are those of the first part, {first}")
         if self._header.global_encoding.gps_time_type != points.header.global_encoding.gps_time_type:
             raise ValueError(
                 f"gps_time is outside 0 to {_SECONDS_OF_WEEK} s in some parts alone; admissible is in all or "
@@ -375,8 +379,10 @@ def las_points(
     offset = np.floor(position.min(axis=0)) if offset is None else offset
     counts = np.round((position - offset) / scale)
     if np.abs(counts).max() >= 2**31:
-        spans = np.ptp(position, axis=0).tolist()
-        raise ValueError(f"position spans {spans}; admissible is 2^31 steps of {scale.tolist()}")
+        spans = np.abs(position - offset).max(axis=0).tolist()
+        raise ValueError(
+            f"position spans {spans} from {offset.tolist()}; admissible is 2^31 steps of {scale.tolist()}"
+        )
     header = laspy.LasHeader(point_format=point_format, version="1.4")
     header.generating_software, header.scales, header.offsets = "jaxlidar", scale, offset
     # From format 6 on, the specification admits well-known text alone.

@@ -123,6 +123,7 @@ def plan_scenes(
     for scene in examined:
         check_kinds(lidar, scene)
     effects = {**effects_of_family(examined), **({} if effects is None else effects)}
+    _check_one_structure(examined)
     cases, options = [(lidar, scene) for scene in examined], {"max_orders": max_orders, **options}
     if options.get("histories") is None and _applied_optics_take_less(
         *cases[0], window=window, effects=effects, **options
@@ -155,16 +156,13 @@ def plan_cases(
 ) -> Plan:
     """Make one plan that serves pairs of a lidar and a scene, each as it is.
 
-    Lidars have one sampling interval; other arguments are those of `plan_scenes`. With a `survey` the plan
-    serves all of its shots over each scene.
-
-    **Raises:** ValueError for scenes of different structure.
+    Lidars have one sampling interval, and scenes one structure; other arguments are those of `plan_scenes`.
+    With a `survey` the plan serves all of its shots over each scene.
 
     1. Plan every case by itself.
     2. Plan every case with the common window, orders, width of fine bins and length of steps.
     3. Take the union of these.
     """
-    _check_one_structure([scene for _, scene in cases])
     common: dict[str, Any] = {**options, "effects": effects, "describe": False}
 
     def plan_case(lidar: Lidar, scene: Scene, settings: Mapping[str, Any]) -> Plan:

@@ -29,6 +29,8 @@ from jaxlidar._fields.checks import (
     check_kind,
     check_number,
     concrete_array,
+    has_tracers,
+    is_within_program,
     kind_of,
 )
 from jaxlidar._jax.memory import format_bytes, machine_memory
@@ -62,7 +64,7 @@ def leaf_mesh(
     leaf: Callable | None = None,
     leaf_angles: str | LeafAngles | None = None,
     clump_leaf_area: float | None = None,
-) -> Any:
+) -> MeshSurface | tuple[MeshSurface, ...]:
     """Make leaves as triangles, at random places, which light hits or misses.
 
     A voxel returns the expected light of its leaves, so that almost every beam has a return from every crown.
@@ -111,6 +113,11 @@ def leaf_mesh(
     check_kind("voxels_or_tree", voxels_or_tree, kinds, "a VoxelMap, a PointCanopy, a Tree or a Stand")
     check_number("leaf_area", leaf_area, 0.0, low_open=True)
     check_key(key)
+    if is_within_program() or has_tracers((voxels_or_tree, leaf, key)):
+        raise TypeError(
+            "leaves are made within a JAX transformation; admissible is to make them outside, and to replace "
+            "the optics or the vertices of the surface within"
+        )
     check_choice("shape", shape, tuple(LEAF_OUTLINES))
     check_kind("leaf_angles", leaf_angles, str | LeafAngles | None, "a name, a LeafAngles or None")
     if clump_leaf_area is not None:
@@ -214,7 +221,7 @@ def _in_stand(
     ratios = np.log([vertical / horizontal, np.where(area > 0, area, 1.0) / horizontal**2])
     kinds = np.stack([stand.individual, *ratios.round(_DIGITS)])[:, leafy]
     _, kind, count = np.unique(kinds, axis=1, return_inverse=True, return_counts=True)
-    groups = [leafy[kind == k] for k in np.flatnonzero(count > 1)]
+    groups = [leafy[kind.ravel() == k] for k in np.flatnonzero(count > 1)]
     meshes = []
     for copies in groups:
         first, h = copies[0], horizontal[copies]

@@ -229,7 +229,9 @@ def _draw_coloured(
     names, numbers = np.unique([name for name, _ in groups], return_inverse=True)
     colours = dict(groups)
     counts = np.bincount(numbers[rows], minlength=len(names))
-    for group in np.argsort(-counts, kind="stable"):
+    heights = np.bincount(numbers[rows], np.asarray(returns.position, float)[rows, 2], len(names))
+    # From the lowest to the highest: the ground must not cover the canopy, however many points it has.
+    for group in np.argsort(heights / np.maximum(counts, 1), kind="stable"):
         if counts[group] == 0:
             continue
         name, chosen = str(names[group]), rows[numbers[rows] == group]

@@ -4,6 +4,7 @@ Colours are those of Okabe and Ito (2008), which are distinct with any colour vi
 """
 
 import itertools
+import re
 from collections.abc import Iterable, Sequence
 from typing import Any
 
@@ -34,7 +35,7 @@ VISIBLE_FRACTION = 0.004
 
 
 def material_colours(names: Iterable[str]) -> dict[str, str]:
-    """Return the colours of materials, by name; several plates are called "plate 1", "plate 2".
+    """Return the colours of materials, by name; several of one name are called "plate 1", "plate 2".
 
     Materials of a mesh, called "mesh:NAME", are told apart: leaf, wood and bark as in voxels, others in
     alphabetical order.
@@ -42,7 +43,7 @@ def material_colours(names: Iterable[str]) -> dict[str, str]:
     others = itertools.cycle(_MESH_COLOURS)
     colours = {}
     for name in sorted(set(names)):
-        kind = name.partition(":")[2] or name.split()[0]
+        kind = re.sub(r" \d+$", "", name).rpartition(":")[2]
         kind = "bark" if kind == "wood" else kind
         if kind in MATERIAL_COLOURS:
             colours[name] = MATERIAL_COLOURS[kind]

@@ -314,7 +314,7 @@ class MeshSurface(eqx.Module):
         places, n_all = self.instances, len(self.faces) * len(self.instances)
         instance, face = np.divmod(np.linspace(0, n_all - 1, min(count, n_all)).astype(int), len(self.faces))
         matrices = _matrices(concrete_array(places.rotation), concrete_array(places.scale), np)[instance]
-        local = (concrete_array(self.vertices) + np.asarray(self.origin, float))[self.faces[face]]
+        local = concrete_array(self.vertices)[self.faces[face]] + np.asarray(self.origin, float)
         return np.einsum("tij,tkj->tki", matrices, local) + concrete_array(places.shift)[instance, None]
 
     def local_corners(self) -> Float[np.ndarray, "triangles 3 3"]:

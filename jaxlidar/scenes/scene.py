@@ -40,7 +40,11 @@ def _as_meshes(x: Any) -> Any:
     """Convert to a tuple. Tuples in it, such as `leaf_mesh` gives of a stand, are taken apart."""
     if not isinstance(x, Iterable):
         return x
-    return tuple(itertools.chain(*(mesh if isinstance(mesh, tuple) else (mesh,) for mesh in x)))
+    return tuple(itertools.chain(*(mesh if _are_surfaces(mesh) else (mesh,) for mesh in x)))
+
+
+def _are_surfaces(x: Any) -> bool:
+    return isinstance(x, tuple) and all(isinstance(mesh, MeshSurface) for mesh in x)
 
 
 @final

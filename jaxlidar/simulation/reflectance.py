@@ -342,10 +342,14 @@ def parallel_lidar(wavelengths: Any, zenith: Any, azimuth: Any, centre: Any) -> 
 
 def distance_above(lidar: Lidar, scene: Scene, size: np.ndarray) -> float:
     """Return the distance before the reference plane, m, at which parallel light starts above a rectangle."""
-    # A footprint whose rim, as plans see it, encloses the rectangle; straight down, heights alone count.
-    divergence = 0.5e3 * float(np.linalg.norm(size)) / _ALTITUDE
-    vertical = dataclasses.replace(lidar, zenith=0.0, divergence=divergence)
-    return PathLengths(vertical, scene).start_distance / math.cos(math.radians(concrete_number(lidar.zenith)))
+    # A footprint whose rim, as plans see it, encloses the rectangle.
+    radius, zenith = 0.5 * float(np.linalg.norm(size)), math.radians(concrete_number(lidar.zenith))
+    beam = dataclasses.replace(lidar, divergence=1e3 * radius / _ALTITUDE)
+    vertical = dataclasses.replace(beam, zenith=0.0)
+    # Straight down, the heights of what stands above the rectangle count. Along the beam, an inclined plane
+    # rises without end; rims lie across the beam, and the rectangle lies level.
+    above = PathLengths(vertical, scene).start_distance / math.cos(zenith)
+    return max(above, PathLengths(beam, scene).start_distance + radius * math.tan(zenith))
 
 
 def _area_in_view(scene: Scene, area: Any) -> tuple[np.ndarray, np.ndarray]:

@@ -48,11 +48,13 @@ class OffMapWarning(UserWarning):
 
 
 def ground_heights(survey: Survey, scene: Scene, start_distance: float) -> Float[np.ndarray, " shots"]:
-    """Return the heights of the ground for a simulation, as `_heights_on_axes`.
+    """Return the heights, m, of the ground where each beam axis meets it; NaN where it meets none.
+
+    `survey`, `scene` and `start_distance` as for `_points_on_ground`.
 
     **Raises:** ValueError for shots outside a ground of finite extent.
     """
-    heights = _heights_on_axes(survey, scene, start_distance)
+    heights = _points_on_ground(survey, scene, start_distance)[:, 2]
     # A plane has no rim: an axis that does not meet it runs along it, and has no height. From a sensor it
     # may go anywhere.
     if scene.ground is None or isinstance(scene.ground.shape, Plane) or survey.has_sensor_position:
@@ -67,23 +69,21 @@ def ground_heights(survey: Survey, scene: Scene, start_distance: float) -> Float
     return heights
 
 
-def _heights_on_axes(survey: Survey, scene: Scene, start_distance: float) -> Float[np.ndarray, " shots"]:
-    """Return the heights, m, of the ground where each beam axis meets it; NaN where it meets none.
+def _points_on_ground(survey: Survey, scene: Scene, start_distance: float) -> Float[np.ndarray, "shots 3"]:
+    """Return where each beam axis meets the ground, m; NaN where it meets none.
 
     `survey` and `scene` have the same origin of coordinates. `start_distance`: distance, m, before the
     reference plane, along the beam, at which rays start: that of a plan.
     """
     if scene.ground is None:
-        return np.full(len(survey), np.nan)
+        return np.full((len(survey), 3), np.nan)
     # From where rays start, above the scene or at the sensor: a ray that starts on the reference plane would
     # miss ground above it.
     start = survey.aim_point - start_distance * survey.direction
-    shape = scene.ground.shape
-    distance = _distances(shape, start, survey.direction)
+    distance = _distances(scene.ground.shape, start, survey.direction)
     # A miss is at FAR; a tenth of that leaves room for rounding.
-    hits = distance < 0.1 * FAR
-    heights = start[:, 2] + np.where(hits, distance, 0.0) * survey.direction[:, 2]
-    return np.where(hits, heights, np.nan)
+    distance = np.where(distance < 0.1 * FAR, distance, np.nan)
+    return start + distance[:, None] * survey.direction
 
 
 def _distance_along_axes(
@@ -137,9 +137,8 @@ def ground_position(survey: Survey, scene: Scene) -> Float[np.ndarray, "shots 3"
     check_kind("survey", survey, Survey, "a Survey")
     check_kind("scene", scene, Scene, "a Scene")
     ground, axis = scene.ground, survey.direction
-    points = np.full((len(survey), 3), np.nan)
     if ground is None:
-        return points
+        return np.full((len(survey), 3), np.nan)
     # About the middle of the survey, as single precision needs.
     origin = 0.5 * (survey.position[:, :2].min(axis=0) + survey.position[:, :2].max(axis=0))
     moved: Any = ground.moved(-origin)
@@ -152,15 +151,8 @@ def ground_position(survey: Survey, scene: Scene) -> Float[np.ndarray, "shots 3"
         crossed, towards = ground.shape.crossing(*lines)
         met = towards < -_LEAST_COSINE
         start_distance = 1.0 - float(crossed[met].min()) if met.any() else 0.0
-    heights = _heights_on_axes(survey, Scene(ground=ground), start_distance)
-    points = survey.aim_point + ((heights - survey.aim_point[:, 2]) / _off_level(axis[:, 2]))[:, None] * axis
-    points[:, 2] = heights
+    points = _points_on_ground(survey, Scene(ground=ground), start_distance)
     return points + np.append(np.zeros(2) if moved is None else origin, 0.0)
-
-
-def _off_level(cosine: Float[np.ndarray, " shots"]) -> Float[np.ndarray, " shots"]:
-    """Return cosines with the vertical, NaN for level axes: a height states no point of these."""
-    return np.where(np.abs(cosine) > 1e-12, cosine, np.nan)
 
 
 def off_map(survey: Survey, scene: Scene) -> Float[np.ndarray, " shots"]:

@@ -41,6 +41,7 @@ Source: Wagner et al. (2004), Int. Arch. Photogramm. Remote Sens. 35, part B3, 2
 
 import dataclasses
 import os
+import re
 import time
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any, NamedTuple, TypeAlias, final
@@ -96,8 +97,6 @@ _ROUNDING_OF_TIMES = 1e-3
 _SAMPLES_AT_ONCE = 100_000
 # Records that are decomposed together, by one compiled program; fewer are filled up with empty ones.
 _RECORDS_AT_ONCE = 64
-# Gaps of the signal below this many lengths of the pulse do not divide a record that is decomposed.
-_MIN_GAP_OF_PULSE = 1.0
 # Least cosine of an axis to the vertical for which the height of a surface gives its range.
 _LEAST_SLOPE = 0.01
 _FWHM_OF_STD = 2.0 * np.sqrt(2.0 * np.log(2.0))
@@ -185,7 +184,9 @@ class DiscreteReturns(eqx.Module):
         vegetation = np.full(len(self), _LOW_VEGETATION + len(_VEGETATION_LIMITS))
         for number, limit in reversed(list(enumerate(_VEGETATION_LIMITS))):
             vegetation[height <= limit] = _LOW_VEGETATION + number
-        classes = np.where(np.isin(self.material, _PLANTS), vegetation, _UNCLASSIFIED)
+        # Surfaces of one name are numbered from 1, as those of the individuals of a stand.
+        names = [name for name in set(self.material.tolist()) if re.sub(r" \d+$", "", name) in _PLANTS]
+        classes = np.where(np.isin(self.material, names), vegetation, _UNCLASSIFIED)
         for name, number in (("ground", _GROUND_CLASS), ("air", _HIGH_NOISE), (_NO_MATERIAL, _LOW_NOISE)):
             classes[self.material == name] = number
         return classes

@@ -67,6 +67,15 @@ def test_points_from_above_have_the_colours_of_their_materials(returns, axes):
     assert (axes.get_xlabel(), axes.get_ylabel()) == ("x, east (m)", "y, north (m)")
 
 
+def test_the_ground_does_not_cover_what_stands_on_it(axes):
+    """However many points either has; planted: the other way round, the order of their numbers is wrong."""
+    position = np.stack([np.zeros(9), np.zeros(9), [0.0, 0.1, 9.0, 8.0, 7.0, 6.0, 5.0, 4.0, 0.2]], axis=1)
+    classes = np.where(position[:, 2] < 1.0, 2, 5)
+    ones = np.ones(9, int)
+    plot.points(jl.io.PointCloud(position, classes, ones, ones, ones, {}), axes)
+    assert list(drawn_points(axes)) == ["ground", "high vegetation"]
+
+
 def test_materials_of_meshes_are_told_apart():
     names = ["mesh:wall", "mesh:roof", "mesh:wire", "mesh:leaf", "mesh:wood", "ground", "mesh"]
     colours = material_colours(names)
@@ -76,6 +85,9 @@ def test_materials_of_meshes_are_told_apart():
         MATERIAL_COLOURS["bark"],
     )
     assert colours["mesh"] == MATERIAL_COLOURS["mesh"]
+    # Those of the individuals of a stand are numbered.
+    assert material_colours(["mesh:leaf 12"]) == {"mesh:leaf 12": MATERIAL_COLOURS["leaf"]}
+    assert material_colours(["plate 1"]) == {"plate 1": MATERIAL_COLOURS["plate"]}
 
 
 def test_points_have_the_names_of_their_classes(returns, axes, tmp_path):

@@ -108,6 +108,17 @@ def test_ground_alone_has_its_reflectance_whatever_its_slope():
     np.testing.assert_allclose(factor, gain * spectrum, rtol=1e-4)
 
 
+@pytest.mark.parametrize("view", [(40.0, 90.0), (45.0, 270.0), (55.0, 270.0)])
+@pytest.mark.parametrize("area", [((-1.0, -1.0), (1.0, 1.0)), ((-10.0, -1.0), (10.0, 1.0))])
+def test_an_inclined_plane_has_its_reflectance_from_whatever_direction(view, area):
+    """Uphill it rises without end; planted: rays that start above its height straight below start too low."""
+    slope = jl.Scene(ground=jl.Ground(reflectance=0.3, slope=30.0, aspect=90.0))
+    settings = {"wavelengths": 865.0, "key": KEY, "n_photons": 64, "area": area}
+    factor = jl.reflectance_factor(slope, sun=(10.0, 0.0), view=view, **settings)
+    # The sun stands across the slope: cos(incidence) is the product of the cosines.
+    np.testing.assert_allclose(factor, 0.3 * np.cos(np.deg2rad(30.0)), rtol=1e-4)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("hotspot", [True, False])
 def test_the_direction_of_the_sun_is_that_of_a_lidar(hotspot):

@@ -24,6 +24,15 @@ def test_axes_beside_open_terrain_meet_no_ground():
     np.testing.assert_allclose(many.ground_height, x[met], atol=1e-3)
 
 
+def test_level_beams_meet_a_hill():
+    """Planted: a point that follows from its height is unknown for an axis without a slope."""
+    hill = jl.Terrain(np.repeat(np.array([0.0, 0, 0, 50, 50, 50])[:, None], 6, axis=1), 10.0, (0.0, 0.0))
+    lidar = jl.Lidar(sensor=(5.0, 25.0, 20.0))
+    survey = jl.Survey(lidar, sensor=[(5.0, 25.0, 20.0)] * 2, zenith=[90.0, 90.0], azimuth=[90.0, 270.0])
+    points = jl.ground_position(survey, jl.Scene(ground=hill))
+    np.testing.assert_allclose(points, [[24.0, 25.0, 20.0], [np.nan] * 3], atol=1e-3)
+
+
 def test_bounds_of_a_terrain_hold_for_lines_that_begin_far_beside_it():
     """Planted: nodes counted from the first line on, as many as the terrain has, end before the peak."""
     heights = np.zeros((21, 11))

@@ -212,6 +212,20 @@ def test_reflectance_and_shares_are_those_of_the_simulation(waveforms):
     np.testing.assert_allclose(returns.ground_share, np.tile([0.0, 1.0], len(waveforms)), atol=0.01)
 
 
+def test_leaves_of_all_individuals_of_a_stand_are_vegetation(waveforms):
+    """Surfaces of one name are numbered; planted: those of another name are not vegetation."""
+    returns = waveforms.returns()
+
+    def classes(name):
+        material = np.where(returns.material == "plate", name, returns.material)
+        return dataclasses.replace(returns, material=material).classification
+
+    vegetation = classes("leaf")
+    assert set(vegetation.tolist()) == {2, 5}
+    np.testing.assert_array_equal(classes("mesh:leaf 12"), vegetation)
+    assert set(classes("mesh:wall 12").tolist()) == {1, 2}
+
+
 def test_returns_have_the_times_and_angles_of_the_survey(survey, waveforms):
     returns = waveforms.returns()
     np.testing.assert_array_equal(returns.gps_time, 3.2e8 + returns.shot / 20.0)

@@ -227,8 +227,17 @@ def test_a_file_in_parts_is_complete_or_not_there(tmp_path, waveforms):
         write()
     with pytest.raises(ValueError, match="is not open"):
         jl.io.LasWriter(path).write(point)
+    with jl.io.LasWriter(tmp_path / "whole.las") as file:
+        file.write(point)
+    for again in (lambda: file.write(point), file.__enter__):
+        with pytest.raises(ValueError, match=r"is not open|is written"):
+            again()
+    (tmp_path / "whole.las").unlink()
     for fields, message in (
-        ({"extra": {"height": ("m", np.ones(1))}}, "extra has other names"),
+        (
+            {"extra": {"height": ("m", np.ones(1))}},
+            r"extra has \['height'\]; admissible are those of the first",
+        ),
         ({"gps_time": np.full(1, 3.2e8)}, "gps_time is outside 0 to 604800 s in some parts alone"),
         ({"intensity": np.full(1, 65536)}, "intensity = 65536 is outside"),
     ):

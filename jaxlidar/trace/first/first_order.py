@@ -284,8 +284,8 @@ class FirstOrderTracer:
         if tally.slopes is not None:
             bins = scene.bins
             inside = tally.slopes[:, bins.max_span : bins.max_span + bins.count]
-            tally = tally._replace(slopes=inside.reshape(*self.shape, bins.count, -1))
-        weights, outside = scene.bins.trim(tally.returned.reshape(*self.shape, -1))
+            tally = tally._replace(slopes=inside.reshape(*self.shape, *inside.shape[1:]))
+        weights, outside = scene.bins.trim(tally.returned.reshape(*self.shape, scene.bins.padded))
         arrived, scattered = tally.arrived.reshape(self.shape), tally.scattered.reshape(self.shape)
         return FirstOrder(weights, outside, arrived, scattered, tally.escaped, tally.slopes)
 

@@ -17,6 +17,7 @@ from inversion.fit.solver import latin_hypercube
 from inversion.fit.uncertainty import estimate_covariance
 from inversion.fit.unknowns import bind_unknowns, optical_arrays
 from jaxlidar.planning.plan import MIN_BATCHES
+from jaxlidar.planning.plan_check import check_plan
 from tests.helpers import BY_PRECISION, ask
 
 LIDAR = jl.Lidar(
@@ -418,6 +419,21 @@ def test_the_plan_serves_the_corners_of_the_bounds():
     high = [Unknown(lambda s: s.ground.height, bounds=(-1.0, 1000.0))]
     with pytest.raises(ValueError, match="at the bounds of the unknowns the scene is inadmissible: altitude"):
         plan_for_bounds(LIDAR, scene, bind_unknowns(high, scene), time, **sizes)
+
+
+def test_the_plan_of_a_fit_refuses_scenes_that_call_for_more_orders():
+    """Its orders are those of the start, as `plan` chooses them, not a number that a user asked for."""
+    height = Unknown(lambda s: s.ground.height, bounds=(-1.0, 1.0))
+    dark, bright = (canopy_scene(leaf=jl.LeafOptics(r, r)) for r in (0.2, 0.49))
+    sizes, time = {"n_photons": 64, "n_rays": 8}, np.arange(-60.0, 20.0)
+    plan = plan_for_bounds(LIDAR, dark, bind_unknowns([height], dark), time, max_orders=None, **sizes)
+    assert plan.scope.automatic_orders
+    with pytest.raises(ValueError, match=rf"it follows {plan.orders} orders"):
+        check_plan(plan, LIDAR, bright)
+    chosen = plan_for_bounds(
+        LIDAR, dark, bind_unknowns([height], dark), time, max_orders=plan.orders, **sizes
+    )
+    check_plan(chosen, LIDAR, bright)
 
 
 def test_covariance_of_a_linear_problem():
