@@ -376,15 +376,15 @@ def las_points(
             raise ValueError(f"{name} has values that are not whole numbers")
     is_geographic = system is not None and system.kind == "geographic"
     scale = np.array(_DEGREES if is_geographic else _MM)
-    offset = np.floor(position.min(axis=0)) if offset is None else offset
-    counts = np.round((position - offset) / scale)
+    corner = np.floor(position.min(axis=0)) if offset is None else offset
+    counts = np.round((position - corner) / scale)
     if np.abs(counts).max() >= 2**31:
-        spans = np.abs(position - offset).max(axis=0).tolist()
+        spans = np.abs(position - corner).max(axis=0).tolist()
         raise ValueError(
-            f"position spans {spans} from {offset.tolist()}; admissible is 2^31 steps of {scale.tolist()}"
+            f"position spans {spans} from {corner.tolist()}; admissible is 2^31 steps of {scale.tolist()}"
         )
     header = laspy.LasHeader(point_format=point_format, version="1.4")
-    header.generating_software, header.scales, header.offsets = "jaxlidar", scale, offset
+    header.generating_software, header.scales, header.offsets = "jaxlidar", scale, corner
     # From format 6 on, the specification admits well-known text alone.
     header.global_encoding.wkt = is_format_6
     if system is not None and system.crs is not None:
