@@ -318,7 +318,8 @@ def plan(
       but 1000, and takes less memory. Default None: histories, but where one response of them would take
       more than 24 MB (some 18 orders of leaves over ground), or leave out orders that are likely to matter
       (dense and bright canopies).
-    - `describe`: True to make the table of effects with its bounds, which takes some 40 ms. Default True.
+    - `describe`: True to make the table of effects with its bounds, which takes some 40 ms, and of a survey
+      the lines on its simulation, some tenths of a second. Default True.
 
     **Returns:** a `Plan`; `print` shows it as a table.
 
