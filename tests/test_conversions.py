@@ -61,3 +61,8 @@ def test_types_are_promoted_by_the_package_itself():
         problem = inversion.Problem(wave.reflectance, jl.Lidar(), start, [height], noise=1e-3, time=wave.time)
         fit = inversion.retrieve(problem, key=jax.random.key(0))
         assert float(fit.values["height"]) == pytest.approx(0.5, abs=0.01)
+        # A plan that is compared with a canopy with open sides, whose heights a transformation traces.
+        canopy = jl.Canopy(voxels, leaf=jl.LeafOptics(0.4, 0.4))
+        wood = jl.Scene(canopy=canopy, ground=jl.Ground())
+        problem = inversion.Problem(None, jl.Lidar(), wood, [height], noise=1e-3, max_orders=1, n_rays=8)
+        assert float(inversion.cramer_rao(problem, key=jax.random.key(0)).stderr["height"]) > 0

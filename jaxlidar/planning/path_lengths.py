@@ -325,12 +325,12 @@ class PathLengths:
         columns = [self._ceil(rate) + 1 for rate in rates]
         if self.scene.canopy.sides == "open":
             # Rays that leave an open map do not come back.
-            columns = [xp.minimum(n, side) for n, side in zip(columns, self.shape)]
+            columns = [xp.minimum(n, float(side)) for n, side in zip(columns, self.shape)]
         longest = height / least_cosine
         if self.scene.canopy.sides == "open":
             longest = xp.minimum(longest, xp.linalg.norm(self.size * self.shape.astype(float)))
         divided = xp.where(max_segment >= self.longest_chord, 0, self._ceil(longest / max_segment))
-        count = self.shape[2] + sum(columns) + divided + len(self.scene.surfaces) + 2
+        count = float(self.shape[2]) + sum(columns) + divided + len(self.scene.surfaces) + 2
         return int(count) if xp is np else count
 
     def longest_flight(self, path: Any) -> Any:
@@ -374,7 +374,7 @@ class PathLengths:
     def voxels_along(self, flight: Any) -> Any:
         """Return a bound on the voxels of a periodic canopy that a flight of that length, m, crosses."""
         # A flight crosses each layer once. Three more, one for each axis, as it starts within a voxel.
-        count = self.shape[2] + sum(self._ceil(flight / s) for s in self.size[:2]) + 3
+        count = float(self.shape[2]) + sum(self._ceil(flight / s) for s in self.size[:2]) + 3
         return int(count) if self.xp is np else count
 
 
