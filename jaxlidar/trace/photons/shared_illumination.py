@@ -117,8 +117,14 @@ def trace_shots(scene: DeviceScene, lidar: Lidar, nodes: EntryNodes, key: PRNGKe
 
 def trace_first_of_shots(
     scene: DeviceScene, lidar: Lidar, shots: Int[Array, "shots"], key: PRNGKeyArray
-) -> FirstOrderWeights:
-    """Trace order one of shots of `scene.shot_views`, one after the other, each from rays of its own beam."""
+) -> tuple[
+    Float[Array, "shots traces materials first_histories bins"],
+    Float[Array, "shots traces materials first_histories"],
+]:
+    """Trace order one of shots of `scene.shot_views`, one after the other, each from rays of its own beam.
+
+    **Returns:** as `trace_first`, for each shot.
+    """
     views = scene.shot_views
     assert views is not None
 
