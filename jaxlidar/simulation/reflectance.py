@@ -419,14 +419,17 @@ def _make_plan(
     is_vertical = sun_zenith is not None and float(sun_zenith) == 0.0
     # A sun that is being traced may stand anywhere.
     sun_cosine = np.cos(np.deg2rad(_MAX_ZENITH if sun_zenith is None else float(sun_zenith)))
-    max_faces = plan.config.max_faces
+    limits, max_faces, start = plan.limits, plan.config.max_faces, distance_above(lidar, scene, extent)
+    max_flight = limits.max_flight
     if scene.canopy is not None:
         lengths = PathLengths(lidar, scene)
-        height = lengths.size[2] * lengths.shape[2]
+        height, longest = lengths.size[2] * lengths.shape[2], limits.max_path + start
+        max_flight = max(max_flight, lengths.longest_flight(longest))
         max_faces = max(max_faces, size_bucket(lengths.voxels_along(height / sun_cosine)))
+        max_faces = max(max_faces, size_bucket(lengths.max_faces(longest)))
     # Light that is not followed is in the result, whatever the albedo.
     plan = dataclasses.replace(plan, scope=dataclasses.replace(plan.scope, albedo=1.0))
-    plan = plan.with_limits(start_distance=distance_above(lidar, scene, extent))
+    plan = plan.with_limits(start_distance=start, max_flight=max_flight)
     return plan.with_config(vertical=is_vertical, max_faces=max_faces)
 
 
