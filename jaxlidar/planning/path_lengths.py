@@ -162,7 +162,7 @@ class PathLengths:
         self.reaches_sensor: Any = False
         if scene.canopy is not None:
             v = scene.canopy.voxels
-            self.size, self.shape = fixed_array(v.voxel_size, xp), np.array(v.shape)
+            self.size, self.shape = fixed_array(v.voxel_size, xp), np.array(v.shape, float)
         if self.from_sensor:
             self._from_sensors(shots)
             return
@@ -182,7 +182,7 @@ class PathLengths:
             crossings += _mesh_crossings(mesh, *lines, repeats=scene.period is not None)
         if scene.canopy is not None:
             low = fixed_array(scene.canopy.voxels.origin, xp)[2]
-            for z in (low, low + self.size[2] * float(self.shape[2])):
+            for z in (low, low + self.size[2] * self.shape[2]):
                 crossed = (z - points[:, 2]) / self.rays[:, 2]
                 crossings.append((crossed, xp.ones_like(crossed, bool)))
         nearest, farthest = self._extremes(crossings, otherwise=0.0)
@@ -320,17 +320,17 @@ class PathLengths:
         if self.scene.canopy is None:
             return 0
         xp, least_cosine = self.xp, self._least_cosine
-        height = self.size[2] * float(self.shape[2])
+        height = self.size[2] * self.shape[2]
         rates = xp.abs(self.rays[:, :2]).max(0) / least_cosine * height / self.size[:2]
         columns = [self._ceil(rate) + 1 for rate in rates]
         if self.scene.canopy.sides == "open":
             # Rays that leave an open map do not come back.
-            columns = [xp.minimum(n, float(side)) for n, side in zip(columns, self.shape)]
+            columns = [xp.minimum(n, side) for n, side in zip(columns, self.shape)]
         longest = height / least_cosine
         if self.scene.canopy.sides == "open":
-            longest = xp.minimum(longest, xp.linalg.norm(self.size * self.shape.astype(float)))
+            longest = xp.minimum(longest, xp.linalg.norm(self.size * self.shape))
         divided = xp.where(max_segment >= self.longest_chord, 0, self._ceil(longest / max_segment))
-        count = float(self.shape[2]) + sum(columns) + divided + len(self.scene.surfaces) + 2
+        count = self.shape[2] + sum(columns) + divided + len(self.scene.surfaces) + 2
         return int(count) if xp is np else count
 
     def longest_flight(self, path: Any) -> Any:
@@ -349,7 +349,7 @@ class PathLengths:
         # Let theta be the beam's zenith angle. A flight of s m within the canopy, up by at most its height,
         # comes closer to the sensor by at most s sin(theta) + height cos(theta). So it lengthens the path by
         # at least s (1 - sin(theta)) - height cos(theta).
-        height, cosine = self.size[2] * float(self.shape[2]), self.xp.abs(self.rays[:, 2]).min()
+        height, cosine = self.size[2] * self.shape[2], self.xp.abs(self.rays[:, 2]).min()
         sine = self.xp.linalg.norm(self.rays[:, :2], axis=1).max()
         return self._affordable((path + height * cosine) / self.xp.maximum(1.0 - sine, 0.1))
 
@@ -374,7 +374,7 @@ class PathLengths:
     def voxels_along(self, flight: Any) -> Any:
         """Return a bound on the voxels of a periodic canopy that a flight of that length, m, crosses."""
         # A flight crosses each layer once. Three more, one for each axis, as it starts within a voxel.
-        count = float(self.shape[2]) + sum(self._ceil(flight / s) for s in self.size[:2]) + 3
+        count = self.shape[2] + sum(self._ceil(flight / s) for s in self.size[:2]) + 3
         return int(count) if self.xp is np else count
 
 

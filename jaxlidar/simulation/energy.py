@@ -62,8 +62,8 @@ class EnergyBudget(eqx.Module):
 
     The fractions that are absorbed, returned, below and unfollowed add up to one, to single precision. What a
     material absorbs is what arrived there less what went on: within its standard error it may be below zero
-    for one that absorbs nothing, and what returns above one. Errors are those of eight batches at least:
-    deviations follow Student's t with seven degrees of freedom.
+    for one that absorbs nothing, and what returns above one. Standard errors come from eight batches at least
+    and are widened for so few: deviations of three of them are more frequent than for a normal distribution.
 
     **Example:**
 
