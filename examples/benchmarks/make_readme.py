@@ -72,9 +72,10 @@ def changes(record: dict) -> str:
     ]
     return page_of(
         "Seconds of a call of `simulate` with three wavelengths after one change, and of the same call "
-        "repeated. Array sizes are rounded up to size buckets, and numbers are arguments of compiled "
-        "programs, so that most changes do not compile the trace (`batch_of_trace_first`, "
-        "`batch_of_trace_higher`) anew.",
+        "repeated; of two scenes the slower one. Array sizes are rounded up to size buckets, and numbers are "
+        "arguments of compiled programs: the trace (`batch_of_trace_first`, `batch_of_trace_higher`) is "
+        "compiled anew where a size changes its bucket, as that of a record whose pulse, window or beam "
+        "changes may, and where an effect is new.",
         table(["change", "s", "s, repeated", "programs compiled"], rows),
     )
 
@@ -639,7 +640,7 @@ def scene_retrieval(record: dict) -> str:
 
 
 def narrow_shots(record: dict) -> str:
-    flight = record["flight"]
+    flight, voxels = record["flight"], record["by voxel"]
     stages = ("simulate", "returns", "files")
     return page_of(
         "Shots of a scanner 0.3 m wide, at first order, over the forest of the surveys above. A numba kernel "
@@ -668,12 +669,39 @@ def narrow_shots(record: dict) -> str:
                 for r in record["by tolerance"]
             ],
         ),
+        f"Over voxels of {', '.join(number(r['voxel']) for r in voxels)} m a shot takes "
+        f"{', '.join(number(r['us per shot']) for r in voxels)} µs to "
+        f"{number(100 * voxels[0]['tolerance'])} %: a beam crosses more of them.",
         f"{flight['shots']:,} shots, line by line, to {number(100 * flight['tolerance'])} %, with returns of "
-        f"the peak detector written as LAZ: {number(flight['seconds'])} s, "
+        f"the peak detector written as one LAZ file: {number(flight['seconds'])} s, "
         f"{number(sum(flight[f'us per shot, {s}'] for s in stages))} µs a shot ("
         + ", ".join(f"{s} {number(flight[f'us per shot, {s}'])}" for s in stages)
         + f"), {flight['points']:,} points of {number(flight['bytes per point'])} bytes, at most "
         f"{number(flight['peak GB'])} GB.",
+    )
+
+
+def leaf_gaps(record: dict) -> str:
+    rings = [f"{low:g} to {high:g} degrees" for low, high in record["rings"]]
+    return page_of(
+        f"Shots of a VZ-400 that stands below crowns, {record['shots']:,} in each ring of zenith angles. A "
+        "voxel returns what is expected of its leaves, so that nearly every shot has a return from every "
+        "crown that it crosses; leaves of 50 cm2 are hit or missed. A beam has a width, and the edge of a "
+        "leaf returns a little of it.",
+        table(
+            ("share of shots", *rings),
+            [(r["what"], *(f"{share:.3f}" for share in r["shares"])) for r in record["rows"]],
+        ),
+        "CPU time of a shot. The hectare is a stand of 400 trees of leaf area index 4, seen from 500 m above "
+        "with footprints of 25 cm; with its leaves the process takes at most "
+        f"{number(record['peak GB'])} GB.",
+        table(
+            ("scene", "leaves", "tolerance", "µs a shot"),
+            [
+                (r["what"], f"{r['leaves']:,}", f"{number(100 * r['rtol'])} %", number(r["us per shot"]))
+                for r in record["costs"]
+            ],
+        ),
     )
 
 
@@ -739,6 +767,7 @@ SECTIONS: dict[str, tuple[str, Callable[[dict], str]]] = {
     "scaling": ("Scaling of cost", scaling),
     "meshes": ("Cost of meshes", meshes),
     "mesh_or_voxels": ("Voxels against triangles", mesh_or_voxels),
+    "leaves": ("Leaves that are hit or missed", leaf_gaps),
     "python_versions": ("Older Pythons", pythons),
     "first_order_march": ("First order against a kernel written by hand", march),
     "one_trace_all_wavelengths": ("Many wavelengths from one trace", wavelengths),

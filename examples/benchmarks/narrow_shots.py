@@ -31,6 +31,8 @@ from jaxlidar.survey.per_shot import LEAST_PARTS_TIMES_RTOL, RAYS_OF_PART
 
 SIDE, SHOTS, SHOTS_OF_LINE, ROUNDS = 120, 5000, 20_000, 5
 TOLERANCES = (0.05, 0.02)
+# Edges of voxels, m.
+EDGES = (1.0, 0.5, 0.25)
 f4 = np.float32
 LIGHT = f4(SPEED_OF_LIGHT)
 
@@ -181,6 +183,30 @@ def by_tolerance(scene: jl.Scene) -> list[dict]:
     return rows
 
 
+def by_voxel(scene: jl.Scene) -> list[dict]:
+    """Return the cost of a shot over voxels of several sizes; leaf area is spread at random within 1 m."""
+    survey, rows, voxels = scan(SIDE, SHOTS), [], scene.canopy.voxels
+    for edge in EDGES:
+        leaf = np.asarray(voxels.leaf)
+        for axis in range(3):
+            leaf = np.repeat(leaf, round(1.0 / edge), axis=axis)
+        if edge < 1.0:
+            leaf = leaf * np.random.default_rng(0).uniform(0.0, 2.0, leaf.shape)
+        fine = jl.VoxelMap.from_extinction(leaf=leaf, voxel_size=edge, origin=voxels.origin)
+        canopy = jl.Canopy(fine, leaf=jl.Prospect(), hotspot=False)
+        fine_scene, rtol = jl.Scene(canopy=canopy, ground=scene.ground), max(TOLERANCES)
+        seconds, waves = fastest(simulate, survey, fine_scene, rtol), simulate(survey, fine_scene, rtol)
+        rows.append(
+            {
+                "voxel": edge,
+                "tolerance": rtol,
+                "us per shot": 1e6 * seconds / len(survey),
+                "error, median": float(np.median(waves.error)),
+            }
+        )
+    return rows
+
+
 def flight(scene: jl.Scene, shots: int, rtol: float) -> dict:
     """Return the cost of many shots in lines, with returns written to one LAZ file line by line."""
     n_lines = max(round(shots / SHOTS_OF_LINE), 1)
@@ -246,7 +272,12 @@ def main() -> None:
     arguments = options("Cost of narrow shots.", million=1_000_000)
     warnings.simplefilter("ignore", jl.OffMapWarning)
     scene = forest(SIDE)
-    record = {"by tolerance": by_tolerance(scene), "flight": flight(scene, arguments.million, 0.05)}
+    record = {
+        "by tolerance": by_tolerance(scene),
+        # Before the finest voxels, whose memory would be its own.
+        "flight": flight(scene, arguments.million, 0.05),
+        "by voxel": by_voxel(scene),
+    }
     record = {"machine": machine(), "side": SIDE, **record}
     write_json(arguments.out / "narrow_shots.json", record)
     draw(record, arguments.out)
