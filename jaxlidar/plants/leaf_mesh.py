@@ -134,7 +134,7 @@ def leaf_mesh(
     elif isinstance(voxels, Tree):
         area = leaf_area if clump_leaf_area is None else clump_leaf_area
         counts = _counts(np.full(len(voxels.bud_radius), area), leaf_area, shape, random)
-        clouds = [_Leaves(points_in_clumps(voxels, counts, random), leaf_area, None)]
+        clouds = [_Leaves(points_in_clumps(voxels, counts, random), leaf_area)]
     else:
         clouds = _in_stand(voxels, leaf_area, clump_leaf_area, shape, random)
     angles = LeafAngles.named("spherical") if angles is None else angles
