@@ -5,6 +5,7 @@ Every material has a channel for what it reflects ("leaf.R", "ground.R"), and an
 weight prod_s optics_s ** n_s; the tuple (n_s) is its history.
 """
 
+import re
 from collections import Counter
 from typing import Any, NamedTuple
 
@@ -50,6 +51,11 @@ def surface_names(scene: Scene) -> list[str]:
         seen[name] += 1
         numbered.append(name if totals[name] == 1 else f"{name} {seen[name]}")
     return numbered
+
+
+def unnumbered(name: str) -> str:
+    """Return the name of a surface without the number that tells it from others of its name."""
+    return re.sub(r" \d+$", "", name)
 
 
 def scene_optics(lidar: Lidar, scene: Scene) -> list[MaterialOptics]:

@@ -4,7 +4,6 @@ Colours are those of Okabe and Ito (2008), which are distinct with any colour vi
 """
 
 import itertools
-import re
 from collections.abc import Iterable, Sequence
 from typing import Any
 
@@ -14,6 +13,7 @@ from matplotlib.axes import Axes
 from matplotlib.ticker import MaxNLocator
 
 from jaxlidar._fields.checks import check_kind, check_number
+from jaxlidar.planning.channels import unnumbered
 from jaxlidar.spectral.waveform import Waveform
 from jaxlidar.survey.waveforms import Waveforms
 
@@ -43,7 +43,7 @@ def material_colours(names: Iterable[str]) -> dict[str, str]:
     others = itertools.cycle(_MESH_COLOURS)
     colours = {}
     for name in sorted(set(names)):
-        kind = re.sub(r" \d+$", "", name).rpartition(":")[2]
+        kind = unnumbered(name).rpartition(":")[2]
         kind = "bark" if kind == "wood" else kind
         if kind in MATERIAL_COLOURS:
             colours[name] = MATERIAL_COLOURS[kind]

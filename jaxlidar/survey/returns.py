@@ -41,7 +41,6 @@ Source: Wagner et al. (2004), Int. Arch. Photogramm. Remote Sens. 35, part B3, 2
 
 import dataclasses
 import os
-import re
 import time
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any, NamedTuple, TypeAlias, final
@@ -64,6 +63,7 @@ from jaxlidar._fields.checks import (
 from jaxlidar._not_kept import NotKept
 from jaxlidar.io.airborne import AirborneShot, Returns, Segment
 from jaxlidar.io.las import LasWriter, write_las
+from jaxlidar.planning.channels import unnumbered
 from jaxlidar.progress import Progress, ProgressOption
 from jaxlidar.sensors.lidar import Lidar
 from jaxlidar.sensors.survey import Survey, beam_directions
@@ -184,8 +184,7 @@ class DiscreteReturns(eqx.Module):
         vegetation = np.full(len(self), _LOW_VEGETATION + len(_VEGETATION_LIMITS))
         for number, limit in reversed(list(enumerate(_VEGETATION_LIMITS))):
             vegetation[height <= limit] = _LOW_VEGETATION + number
-        # Surfaces of one name are numbered from 1, as those of the individuals of a stand.
-        names = [name for name in set(self.material.tolist()) if re.sub(r" \d+$", "", name) in _PLANTS]
+        names = [name for name in set(self.material.tolist()) if unnumbered(name) in _PLANTS]
         classes = np.where(np.isin(self.material, names), vegetation, _UNCLASSIFIED)
         for name, number in (("ground", _GROUND_CLASS), ("air", _HIGH_NOISE), (_NO_MATERIAL, _LOW_NOISE)):
             classes[self.material == name] = number
