@@ -17,12 +17,11 @@ from jaxlidar.planning.plan import DEFAULT_RTOL, Plan
 from jaxlidar.planning.plan import plan as make_plan
 from jaxlidar.planning.setup import Setup, make_setup
 from jaxlidar.scenes.scene import Scene
-from jaxlidar.scenes.terrain import Terrain
 from jaxlidar.sensors.lidar import AIM_DISTANCE
 from jaxlidar.sensors.survey import Survey
 from jaxlidar.survey.footprint_splines import FootprintSplines, fit_footprints
 from jaxlidar.survey.node_groups import IlluminatedNodes, NodeGroup, illuminated_nodes, make_groups
-from jaxlidar.survey.per_shot import MAX_WAVELENGTHS_OF_NARROW, PerShotStrategy
+from jaxlidar.survey.per_shot import PerShotStrategy
 from jaxlidar.survey.results import OPTIONAL_ARRAYS, SAMPLED_ARRAYS
 from jaxlidar.survey.shared_illumination import SharedIlluminationStrategy
 from jaxlidar.survey.strategy import AbstractStrategy
@@ -48,10 +47,6 @@ _PHOTONS_DIVISOR, _RAYS_DIVISOR = 4.0, 2.0
 _PHOTONS_DIVISOR_OF_SHOT_TALLIES = 1.0
 # Sharing pays where at least this many footprints overlap in the mean, by either tally, for this many shots.
 _MIN_OVERLAP, _MIN_OVERLAP_OF_SHOT_TALLIES, _MIN_SHOTS = 1.3, 2.0, 4
-# A few rays resolve the edges of voxels in footprints that meet this many columns of them (see `per_shot`).
-_COLUMNS_WITH_FEW_EDGES = 2.0
-# ... seen at zenith angles of at most this many degrees.
-_STEEP_ZENITH = 60.0
 # Numbers of rays and of photons of a batch are powers of two in these ranges: surveys share compiled
 # programs.
 _RAYS, _PHOTONS = (64, 4096), (256, 8192)
@@ -90,8 +85,7 @@ def choose_strategy(
     strategy = _shared_illumination(relative_survey, setup, rtol, kept_names, shared)
     if strategy is not None:
         return strategy
-    resolves_edges = _resolves_edges(plan, columns, survey, scene)
-    return PerShotStrategy(setup, relative_survey, rtol, kept_names, resolves_edges)
+    return PerShotStrategy(setup, relative_survey, rtol, kept_names)
 
 
 @survey_lines.register
@@ -140,25 +134,6 @@ def _columns_of_footprint(plan: Plan, survey: Survey, scene: Scene) -> float:
 def _cells_across(width: float, edge: float) -> float:
     """Return about how many cells of an edge a width meets, in the mean over positions."""
     return 1.0 + width / edge
-
-
-def _resolves_edges(plan: Plan, columns: float, survey: Survey, scene: Scene) -> bool:
-    """Return True if a few rays resolve the edges of what a footprint meets.
-
-    These are few columns of voxels, and few facets of terrain. The beam comes from above, and not at a
-    grazing angle, at which a path meets the edges of many voxels.
-    """
-    if plan.orders > 1 or not plan.is_random or columns > _COLUMNS_WITH_FEW_EDGES:
-        return False
-    if survey.has_sensor_position or np.max(survey.zenith) > _STEEP_ZENITH:
-        return False
-    assert scene.canopy is not None
-    if scene.plates or scene.canopy.is_straight or survey.lidar.wavelength.size > MAX_WAVELENGTHS_OF_NARROW:
-        return False
-    if not (isinstance(scene.ground, Terrain) and scene.ground.relief):
-        return True
-    width, spacing = 2.0 * np.max(survey.footprint_radius), np.min(concrete_array(scene.ground.spacing))
-    return _cells_across(float(width), float(spacing)) ** 2 <= _COLUMNS_WITH_FEW_EDGES
 
 
 def _rays_of_batch(plan: Plan, columns: float, rtol: float) -> int:
