@@ -504,7 +504,7 @@ def _trace_narrow_shots(
     return jax.lax.while_loop(lambda s: jnp.any(is_pending(*s)), next_round, (no_parts, no_results))[1]
 
 
-def error_of_interleaved(scene: DeviceScene, zenith: Array) -> Array:
+def error_of_interleaved(scene: DeviceScene, zenith: Array | np.ndarray) -> Array:
     """Return the standard error of the mean of interleaved lattices over that of as many independent ones.
 
     `zenith`: degrees, of the beam, which is slant if it crosses half a voxel on its way through the map.
