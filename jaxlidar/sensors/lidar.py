@@ -19,6 +19,7 @@ the apparent reflectance rho is E eta A rho / (pi r^2) with its own range r, as 
 is then the point s + w, 1 m ahead of the sensor: widths of the beam are stated there.
 """
 
+import dataclasses
 import math
 from collections.abc import Sequence
 from typing import Any, ClassVar, final
@@ -231,7 +232,10 @@ class Lidar(eqx.Module):
         if sensor is not None:
             for field, value in (("altitude", altitude), ("position", position)):
                 if not isinstance(value, _Default):
-                    raise ValueError(f"{field} is given together with sensor; admissible is one of them")
+                    raise ValueError(
+                        f"{field} is given together with sensor; admissible is one of them: Lidar.at places "
+                        "a lidar that has an altitude, such as an instrument, by its sensor"
+                    )
             if not _is_sensor(sensor):
                 raise ValueError(f"sensor = {sensor!r}; admissible are three numbers: x, y and z, m")
             position, altitude = sensor, None
@@ -281,6 +285,31 @@ class Lidar(eqx.Module):
 
     def __str__(self) -> str:
         return object_text(self, {"position": "sensor"} if self.has_sensor_position else None)
+
+    def at(self, sensor: Any, zenith: Any = None, azimuth: Any = None) -> "Lidar":
+        """Place this lidar by the position of its sensor, such as an instrument of `instrument` on a tripod.
+
+        **Arguments:**
+
+        - `sensor`: (x, y, z) in m, as that of `Lidar`: anywhere. Time zero is then the emission.
+        - `zenith`, `azimuth`: direction in degrees. Default None: the present one.
+
+        **Returns:** a `Lidar`, in all else the same.
+
+        **Raises:** as `Lidar`.
+
+        **Example:**
+
+        >>> import jaxlidar as jl
+        >>> drone = jl.instrument("RIEGL VUX-1UAV").at((4.0, 2.0, 60.0), zenith=10.0)
+        >>> drone.sensor.tolist(), drone.altitude, float(drone.zenith)
+        ([4.0, 2.0, 60.0], None, 10.0)
+        """
+        if not _is_sensor(sensor):
+            raise ValueError(f"sensor = {sensor!r}; admissible are three numbers: x, y and z, m")
+        angles = {"zenith": zenith, "azimuth": azimuth}
+        angles = {name: angle for name, angle in angles.items() if angle is not None}
+        return dataclasses.replace(self, position=sensor, altitude=None, **angles)
 
     @property
     def opens_at_first_return(self) -> bool:

@@ -1,5 +1,7 @@
 """The lidar: defaults, conventions of axes and angles, and inadmissible arguments."""
 
+import dataclasses
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -7,6 +9,7 @@ import numpy as np
 import pytest
 
 from jaxlidar.extend import along
+from jaxlidar.sensors.catalogue import instrument
 from jaxlidar.sensors.lidar import Lidar
 from jaxlidar.sensors.pulse import GaussianPulse, RectangularPulse
 from jaxlidar.sensors.receiver import Receiver
@@ -120,6 +123,25 @@ def test_values_are_leaves_and_do_not_retrace():
 def test_inadmissible_input_is_refused(fields, message):
     with pytest.raises(ValueError, match=message):
         Lidar(**fields)
+
+
+def test_an_instrument_stands_anywhere():
+    """`dataclasses.replace` gives altitude and position again, and says the way out."""
+    scanner = instrument("RIEGL VUX-1UAV")
+    with pytest.raises(ValueError, match=r"altitude is given together with sensor; .* Lidar\.at places"):
+        dataclasses.replace(scanner, sensor=(0.0, 0.0, 0.0))
+    for zenith, azimuth in ((None, None), (120.0, 30.0)):
+        placed = scanner.at((4e5, 5.3e6, 60.25), zenith, azimuth)
+        again = dataclasses.replace(placed.at((1.0, 2.0, 3.0)), position=placed.position)
+        assert eqx.tree_equal(placed, again)
+        direct = {"sensor": (4e5, 5.3e6, 60.25), "zenith": zenith or 0.0, "azimuth": azimuth or 0.0}
+        fields = dataclasses.fields(scanner)
+        rest = {f.name: getattr(scanner, f.name) for f in fields if f.name not in ("altitude", "position")}
+        assert eqx.tree_equal(placed, Lidar(**(rest | direct)))
+    with pytest.raises(ValueError, match=r"sensor = \(0, 0\); admissible are three numbers"):
+        scanner.at((0, 0))
+    with pytest.raises(ValueError, match="zenith = 200"):
+        scanner.at((0, 0, 0), zenith=200.0)
 
 
 def test_the_longest_flight_returns_at_the_end_of_the_record():
