@@ -49,8 +49,8 @@ from jaxlidar.simulation.one_scene import simulate
 # Arguments of `simulate` that a file cannot hold, or that a case has as fields.
 _EXCLUDED_ARGUMENTS = ("lidar", "scene", "key", "plan", "progress")
 _SECTIONS = ("lidar", "survey", "scene", "simulate")
-# Arguments of `simulate_many`; `simulate` has all but the last two as well.
-_SURVEY_ARGUMENTS = ("rtol", "max_orders", "truth", "shared", "keep")
+# Arguments of `simulate_many`; `simulate` has all but the last three as well.
+_SURVEY_ARGUMENTS = ("rtol", "max_orders", "truth", "shared", "keep", "beyond")
 
 
 @final
@@ -64,7 +64,8 @@ class Case:
     - `scene`: a `Scene`, or None. Default None.
     - `key`: a JAX random key, or None. Default None.
     - `arguments`: by name, other arguments of `jaxlidar.simulate`, such as `rtol`; all but `plan` and
-      `progress`. With a survey: `rtol`, `max_orders`, `truth`, `shared` and `keep`. Default: none.
+      `progress`. With a survey: `rtol`, `max_orders`, `truth`, `shared`, `keep` and `beyond`.
+      Default: none.
     - `survey`: a `Survey`, which is simulated in place of the lidar, or None. Default None.
 
     **Raises:** TypeError for an object of another class; ValueError for an unknown argument, and, with a
@@ -204,6 +205,7 @@ def case_of(text: str, path: Path, read_array: ArrayReader) -> Case:
                 **signature,
                 "shared": Argument(bool | None, False, "", "shared"),
                 "keep": Argument(tuple[str, ...], False, "", "keep"),
+                "beyond": Argument(str, False, "", "beyond"),
             }
         check_keys(table, (*signature, "seed", "key", "key_kind"), "simulate")
         arguments = {

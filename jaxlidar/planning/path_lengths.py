@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from jaxlidar._fields.checks import (
     array_namespace,
@@ -674,37 +674,15 @@ def check_scene_near_beams(shots: Lidar | Survey, scene: Scene) -> None:
 def check_footprints_on_terrain(shots: Lidar | Survey, scene: Scene) -> None:
     """Refuse footprints that lie partly off open terrain. 3e-4 of a Gaussian beam may lie off it.
 
-    1. For all shots at once: the extent of the rim's rays between the terrain's lowest and highest points.
-    2. For shots where that crosses the border: the extent between the heights beneath their own rays.
-
-    **Raises:** ValueError with the shot and both extents.
+    **Raises:** ValueError with the shot, both extents, and the way out.
     """
-    ground = scene.ground
-    if not (isinstance(ground, Terrain) and ground.relief and ground.sides == "open"):
-        return
     survey = shots if isinstance(shots, Survey) else Survey.of(shots)
-    # A sensor that may look up or aside sees past the border of the terrain, where nothing is.
-    if survey.has_sensor_position:
+    if not has_border(survey, scene):
         return
-    origin, end, heights = concrete_array(ground.origin), ground.end, concrete_array(ground.heights)
-    rims = footprint_rims(survey, _TERRAIN_RADII if survey.lidar.profile == "gaussian" else 1.0)
-    # Rays that do not go down meet no ground: a tiny slope puts them far off the terrain.
-    downward = np.minimum(rims.rays[..., 2], -1e-9)
-    steps = [(z - rims.points[..., 2]) / downward for z in (heights.min(), heights.max())]
-    # Between the terrain's extreme heights all rays meet the ground. Coordinate by coordinate: NumPy reduces
-    # long rows many times faster than columns of two.
-    ends = [
-        np.concatenate([rims.points[..., k] + rims.rays[..., k] * step for step in steps], axis=1)
-        for k in range(2)
-    ]
-    low, high = (np.stack([f(e, axis=1) for e in ends], axis=1) + survey.position for f in (np.min, np.max))
-    for i in np.flatnonzero(np.any((low < origin) | (high > end), axis=1)):
-        position = survey.position[i]
-        # Coordinates about the aim point, as those of the rim.
-        shape = ground.moved(-position).shape
-        assert isinstance(shape, HeightField)
-        box, lowest, highest = shape.height_bounds_below(rims.points[i], rims.rays[i])
-        box = box + position
+    terrain: Any = scene.ground
+    rims, (origin, end) = _terrain_rims(survey), _extent(terrain, np)
+    for i in np.flatnonzero(_near_border(rims, survey, terrain, 0.0)[0]).tolist():
+        box, lowest, highest = _box_on_terrain(rims, survey, i, terrain)
         if np.all(box[0] >= origin) and np.all(box[1] <= end):
             continue
         footprint = "the footprint" if len(survey) == 1 else f"the footprint of shot {i} of {len(survey)}"
@@ -715,5 +693,71 @@ def check_footprints_on_terrain(shots: Lidar | Survey, scene: Scene) -> None:
         )
         raise ValueError(
             "{} lies off the terrain: between heights of {:.6g} and {:.6g} m it takes in {} and {}; the "
-            "terrain has {} and {}".format(footprint, lowest, highest, *extents)
+            "terrain has {} and {}; admissible are footprints on it: Survey.within keeps those, and "
+            "simulate_many(..., beyond='miss') leaves the others empty".format(
+                footprint, lowest, highest, *extents
+            )
         )
+
+
+def footprints_on_terrain(survey: Survey, scene: Scene, margin: float = 0.0) -> Bool[np.ndarray, " shots"]:
+    """Return the shots that `check_footprints_on_terrain` admits, `margin`, m, or more within the border."""
+    is_on = np.ones(len(survey), bool)
+    if has_border(survey, scene):
+        terrain: Any = scene.ground
+        rims, (origin, end) = _terrain_rims(survey), _extent(terrain, np)
+        may_be_off, is_off = _near_border(rims, survey, terrain, margin)
+        is_on = ~is_off
+        for i in np.flatnonzero(may_be_off & ~is_off).tolist():
+            box, _, _ = _box_on_terrain(rims, survey, i, terrain)
+            is_on[i] = np.all(box[0] >= origin + margin) and np.all(box[1] <= end - margin)
+    return is_on
+
+
+def has_border(survey: Survey, scene: Scene) -> bool:
+    """Return True if footprints must lie on open terrain. A sensor may look past its border."""
+    ground = scene.ground
+    is_open = isinstance(ground, Terrain) and ground.relief and ground.sides == "open"
+    return is_open and not survey.has_sensor_position
+
+
+def _near_border(
+    rims: FootprintRims, survey: Survey, terrain: Any, margin: float
+) -> tuple[Bool[np.ndarray, " shots"], Bool[np.ndarray, " shots"]]:
+    """Return the shots that may lie partly off a terrain, and those that do for sure.
+
+    Between the terrain's extreme heights all rays meet the ground. A shot may be off it if a ray crosses the
+    border in between, and is off it if a ray lies beyond it at both heights.
+
+    `margin`: m by which the border is moved inwards.
+    """
+    origin, end = _extent(terrain, np)
+    heights = concrete_array(terrain.heights)
+    # Rays that do not go down meet no ground: a tiny slope puts them far off the terrain.
+    downward = np.minimum(rims.rays[..., 2], -1e-9)
+    steps = [(z - rims.points[..., 2]) / downward for z in (heights.min(), heights.max())]
+    may_be_off, is_off = np.zeros((2, len(survey)), bool)
+    # Coordinate by coordinate: NumPy reduces long rows many times faster than columns of two.
+    for k in range(2):
+        places = rims.points[..., k] + survey.position[:, k, None]
+        ends = [places + rims.rays[..., k] * step for step in steps]
+        for a, b in ([e < origin[k] + margin for e in ends], [e > end[k] - margin for e in ends]):
+            may_be_off |= np.any(a | b, axis=1)
+            is_off |= np.any(a & b, axis=1)
+    return may_be_off, is_off
+
+
+def _box_on_terrain(
+    rims: FootprintRims, survey: Survey, shot: int, terrain: Terrain
+) -> tuple[Float[np.ndarray, "2 2"], float, float]:
+    """Return the extent of a footprint between the heights beneath its own rays, m, and these heights, m."""
+    # Coordinates about the aim point, as those of the rim.
+    position = survey.position[shot]
+    shape = terrain.moved(-position).shape
+    assert isinstance(shape, HeightField)
+    box, lowest, highest = shape.height_bounds_below(rims.points[shot], rims.rays[shot])
+    return box + position, lowest, highest
+
+
+def _terrain_rims(survey: Survey) -> FootprintRims:
+    return footprint_rims(survey, _TERRAIN_RADII if survey.lidar.profile == "gaussian" else 1.0)

@@ -34,6 +34,7 @@ from jaxlidar._fields.checks import (
     warn_unit,
 )
 from jaxlidar._jax.memory import format_bytes, machine_memory
+from jaxlidar._registry import shots_within
 from jaxlidar._text import number_text
 from jaxlidar.sensors.lidar import AIM_DISTANCE, STRAIGHT_UP, Lidar
 from jaxlidar.sensors.scan import MAX_ZENITH, AbstractScan
@@ -175,6 +176,38 @@ class Survey(eqx.Module):
         fields = ("zenith", "azimuth", "altitude", "gps_time", "scan_angle", "flight_line")
         place = {"sensor" if self.has_sensor_position else "position": self.position[shots]}
         return Survey(self.lidar, **place, **{name: rows(getattr(self, name)) for name in fields})
+
+    def within(self, scene: Any, margin: SupportsFloat = 0.0) -> "Survey":
+        """Return the survey of the shots that meet a scene, such as those of a strip over a plot.
+
+        A scene ends where its open terrain ends, or, over ground without a border, at the box around its
+        canopy with open sides and its meshes. A scene with none of these has no end, and all shots meet it.
+
+        - On open terrain, the footprint must lie on it, as `simulate_many` asks for; of shots that are placed
+          by their sensors, the beam axis must meet the terrain, or the box around canopy and meshes.
+        - Elsewhere the beam axis must meet that box, and ground that has a border.
+
+        **Arguments:**
+
+        - `scene`: a `Scene`.
+        - `margin`: m from the border of the scene, inwards, that shots must keep; where light is scattered
+          many times, they miss what would stand beyond it. Negative: outwards. Default 0.
+
+        **Returns:** a `Survey`, its shots in their order.
+
+        **Raises:** ValueError where no shot meets the scene, and for a margin that is not finite; TypeError
+        for objects of the wrong type.
+
+        **Example:**
+
+        >>> import numpy as np, jaxlidar as jl
+        >>> plot = jl.Scene(ground=jl.Terrain(np.zeros((21, 21)), spacing=1.0, origin=(0.0, 0.0)))
+        >>> strip = jl.Survey.track(jl.Lidar(), start=(-50, 10), end=(50, 10), spacing=5.0)
+        >>> strip.within(plot, margin=2.0).position[:, 0].tolist()
+        [5.0, 10.0, 15.0]
+        """
+        check_number("margin", margin)
+        return self.subset(np.flatnonzero(shots_within(self, scene, float(margin))))
 
     def _lidar_at(self, position: Float[np.ndarray, "axes"], shot: int) -> Lidar:
         """Place the lidar at a position, in the direction of a shot."""
@@ -623,11 +656,10 @@ def _of_kind(lidar: Lidar, has_sensors: bool) -> Lidar:
     """Return the lidar as one that is placed by its sensor, or by its altitude."""
     if lidar.has_sensor_position == has_sensors:
         return lidar
-    place: dict[str, Any] = {"position": (0.0, 0.0), "altitude": 1000.0}
-    if has_sensors:
-        place = {"position": concrete_array(lidar.sensor), "altitude": None}
     # The angles of shots take the place of the lidar's, which may not be admissible for the other kind.
-    return dataclasses.replace(lidar, **place, zenith=0.0)
+    if has_sensors:
+        return lidar.at(concrete_array(lidar.sensor), zenith=0.0)
+    return dataclasses.replace(lidar, position=(0.0, 0.0), altitude=1000.0, zenith=0.0)
 
 
 def _per_shot(field: str, x: Any, shots: int) -> Float[np.ndarray, " shots"]:

@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 
 import jax
 import numpy as np
+from jaxtyping import Int
 
 from jaxlidar._fields.checks import warn_user
 from jaxlidar._not_kept import NotKept
@@ -60,6 +61,30 @@ class StoredShots(NamedTuple):
 
     is_done: np.ndarray
     write: Callable[[Shots, Any], None]
+
+
+def _stored_shots(
+    is_done: np.ndarray,
+    write: Callable[[Shots, Any], None],
+    hits: Int[np.ndarray, " hits"] | None,
+    fill: float = 0.0,
+) -> StoredShots:
+    """Return the rows of a store that are shots of a strategy. The others have `fill`, and come first."""
+    if hits is None:
+        return StoredShots(is_done, write)
+    misses = np.setdiff1d(np.arange(len(is_done)), hits)
+    # Damaged rows of misses are written again with those of hits.
+    hits_done = is_done[hits] & is_done[misses].all()
+
+    def write_all(shots: Shots, results: Any) -> None:
+        if not is_done[misses].all():
+            write(
+                misses, jax.tree.map(lambda a: np.full((len(misses), *a.shape[1:]), fill, a.dtype), results)
+            )
+        write(hits[shots], results)
+        hits_done[shots] = True
+
+    return StoredShots(hits_done, write_all)
 
 
 class StoredContributions:
@@ -137,29 +162,46 @@ class SurveyResults:
                 self.light.write(shots, contribution_sum(self.contributions.__getitem__, shots))
 
 
+def at_rows(rows: Any, count: int, values: Any, fill: float = 0.0) -> Any:
+    """Return arrays with `values` in `rows` of `count` rows, and `fill` in the others; unchanged for None."""
+
+    def place(a: np.ndarray) -> np.ndarray:
+        full = np.full((count, *a.shape[1:]), fill, a.dtype)
+        full[rows] = a
+        return full
+
+    return values if rows is None else jax.tree.map(place, values)
+
+
 def waveforms_in_memory(
-    results: SurveyResults, survey_fields: dict[str, Any], start_time: float, **info: Any
+    results: SurveyResults,
+    survey_fields: dict[str, Any],
+    hits: Int[np.ndarray, " hits"] | None,
+    start_time: float,
+    **info: Any,
 ) -> Waveforms:
     """Return all waveforms from the results of all tasks.
 
-    `survey_fields`: the fields of `Waveforms` that are known before any tracing. `info`: further entries of
-    `Waveforms.info`.
+    `survey_fields`: the fields of `Waveforms` that are known before any tracing. `hits`: numbers in the
+    survey of the shots of the strategy, or None where these are all; the others are empty. `info`: further
+    entries of `Waveforms.info`.
     """
     assert isinstance(results.light, ShotsInMemory)
     assert isinstance(results.truth, ShotsInMemory)
-    light = results.light.values
+    count = len(survey_fields["zenith"])
+    light = at_rows(hits, count, results.light.values)
     refuse_excess(light[EXCESS])
     _warn_of_missing_light(results.strategy, *(light[name] for name in MISSING_LIGHT))
     fields = {**survey_fields, **_fields_of(light)}
     if results.truth.values is not None:
-        fields["truth"] = _truth(results.strategy, results.truth.values)
+        fields["truth"] = _truth(results.strategy, at_rows(hits, count, results.truth.values, np.nan))
     return _waveforms(results.strategy, fields, _info(results.strategy, start_time) | info)
 
 
 class StoredSurvey:
     """The store of a survey, with the layout of `Waveforms`: `jaxlidar.open` reads it when it is finished.
 
-    `survey_fields`: as in `waveforms_in_memory`. `case`: that of the survey, or None.
+    `survey_fields`, `hits`: as in `waveforms_in_memory`. `case`: that of the survey, or None.
     """
 
     def __init__(
@@ -167,16 +209,17 @@ class StoredSurvey:
         store: ResultStore,
         strategy: AbstractStrategy,
         survey_fields: dict[str, Any],
+        hits: Int[np.ndarray, " hits"] | None,
         case: Case | None,
     ):
         self._store, self._strategy, self._survey_fields, self._case = store, strategy, survey_fields, case
-        count, chunk = len(strategy.survey), strategy.shot_slices[0].stop
+        count, chunk = len(survey_fields["zenith"]), strategy.shot_slices[0].stop
         self._light = store.rows("", "shot", count, chunk)
-        light, truth = StoredShots(self._light.is_done, self._write_light), ShotsInMemory(count)
+        light, truth = _stored_shots(self._light.is_done, self._write_light, hits), ShotsInMemory(count)
         self._has_truth = strategy.n_tasks > strategy.n_light_tasks
         if self._has_truth:
             self._truth = store.rows("truth", "shot", count, chunk)
-            truth = StoredShots(self._truth.is_done, self._write_truth)
+            truth = _stored_shots(self._truth.is_done, self._write_truth, hits, np.nan)
         contributions = StoredContributions(store, strategy) if strategy.n_contributions else {}
         if damaged := store.damaged_arrays():
             warn_user(

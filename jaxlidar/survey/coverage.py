@@ -3,16 +3,19 @@
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
-from jaxlidar._fields.checks import as_array, check_kind
+from jaxlidar._fields.checks import as_array, check_kind, concrete_array
 from jaxlidar._jax.programs import Program
+from jaxlidar._registry import shots_within
 from jaxlidar._text import NOTABLE_FRACTION, percent
 from jaxlidar._vectors import FAR, vec
+from jaxlidar.planning.path_lengths import footprints_on_terrain
 from jaxlidar.planning.size_buckets import size_bucket
 from jaxlidar.scenes.canopy import Canopy
 from jaxlidar.scenes.scene import Scene
 from jaxlidar.scenes.shapes import AbstractShape, Plane
+from jaxlidar.scenes.terrain import Terrain
 from jaxlidar.sensors.lidar import AIM_DISTANCE
 from jaxlidar.sensors.survey import Survey
 
@@ -64,7 +67,8 @@ def ground_heights(survey: Survey, scene: Scene, start_distance: float) -> Float
         numbers = ", ".join(map(str, misses[:5])) + (", ..." if misses.size > 5 else "")
         raise ValueError(
             f"position: {misses.size} of {len(survey)} shots do not meet the ground: shots {numbers}; "
-            "admissible are shots above it: ground_position is not NaN for those"
+            "admissible are shots above it: Survey.within keeps those, and simulate_many(..., "
+            "beyond='miss') leaves the others empty"
         )
     return heights
 
@@ -122,8 +126,8 @@ def ground_position(survey: Survey, scene: Scene) -> Float[np.ndarray, "shots 3"
 
     **Returns:** (shots, 3) x, y and z, m; NaN where an axis meets no ground.
 
-    Over open terrain a simulation admits the shots that are not NaN (`Survey.subset`), but for those at its
-    border whose footprints lie partly off it.
+    `Survey.within` keeps the shots that `simulate_many` admits: of those that are not NaN, all but the ones
+    whose footprints lie partly off open terrain.
 
     **Raises:** TypeError for objects of the wrong type.
 
@@ -153,6 +157,71 @@ def ground_position(survey: Survey, scene: Scene) -> Float[np.ndarray, "shots 3"
         start_distance = 1.0 - float(crossed[met].min()) if met.any() else 0.0
     points = _points_on_ground(survey, Scene(ground=ground), start_distance)
     return points + np.append(np.zeros(2) if moved is None else origin, 0.0)
+
+
+def shots_on_ground(survey: Survey, scene: Scene, margin: float = 0.0) -> Bool[np.ndarray, " shots"]:
+    """Return the shots that a simulation admits: footprints on open terrain, axes that meet other ground.
+
+    `margin`: m from the border of open terrain, inwards.
+    """
+    ground, is_on = scene.ground, footprints_on_terrain(survey, scene, margin)
+    has_border = not (ground is None or isinstance(ground, Terrain) or isinstance(ground.shape, Plane))
+    if has_border and not survey.has_sensor_position:
+        is_on &= np.isfinite(ground_position(survey, scene)[:, 2])
+    return is_on
+
+
+@shots_within.register
+def _shots_within(survey: Survey, scene: Scene, margin: float) -> Bool[np.ndarray, " shots"]:
+    """Return the shots that `Survey.within` keeps. **Raises:** as that."""
+    check_kind("scene", scene, Scene, "a Scene")
+    ground, box = scene.ground, _box(scene)
+    is_within, extent = shots_on_ground(survey, scene, margin), box
+    if isinstance(ground, Terrain) and ground.sides == "open":
+        extent = np.stack([concrete_array(ground.origin), ground.end])
+        if survey.has_sensor_position:
+            place = ground_position(survey, scene)[:, :2]
+            is_within = np.all((place >= extent[0] + margin) & (place <= extent[1] - margin), axis=1)
+            is_within |= False if box is None else _meets_box(survey, box, margin)
+    elif box is not None:
+        is_within &= _meets_box(survey, box, margin)
+    if not is_within.any():
+        positions = survey.position[:, :2]
+        of_shots = _extent_text(positions.min(axis=0), positions.max(axis=0))
+        of_scene = "ground without their beams" if extent is None else _extent_text(*extent)
+        raise ValueError(
+            f"survey: no shot lies within the scene: positions are {of_shots}, the scene is {of_scene}, with "
+            f"margin = {margin:g} m; are their coordinates those of one map?"
+        )
+    return is_within
+
+
+def _extent_text(low: Float[np.ndarray, "axes"], high: Float[np.ndarray, "axes"]) -> str:
+    return f"x = {low[0]:.2f} to {high[0]:.2f} m and y = {low[1]:.2f} to {high[1]:.2f} m"
+
+
+def _box(scene: Scene) -> Float[np.ndarray, "2 3"] | None:
+    """Return the corners of the box around a canopy with open sides and meshes that do not repeat, m."""
+    corners = []
+    if scene.canopy is not None and scene.canopy.sides == "open":
+        voxels = scene.canopy.voxels
+        # In double precision, as map coordinates need.
+        low, size = (concrete_array(a) for a in (voxels.origin, voxels.voxel_size))
+        corners += [low, low + size * voxels.shape]
+    if scene.period is None:
+        corners += [corner for mesh in scene.meshes for corner in mesh.bounds().reshape(-1, 3)]
+    return np.stack([np.min(corners, axis=0), np.max(corners, axis=0)]) if corners else None
+
+
+def _meets_box(survey: Survey, box: Float[np.ndarray, "2 3"], margin: float) -> Bool[np.ndarray, " shots"]:
+    """Return the shots whose beam axes meet a box, with its sides `margin`, m, further inwards."""
+    inwards = np.array([margin, margin, 0.0])
+    # A ray along a face: so slow across it that it meets the other faces of its slab far away.
+    rate = np.where(np.abs(survey.direction) < 1e-12, 1e-12, survey.direction)
+    faces = np.stack([(corner - survey.sensor) / rate for corner in (box[0] + inwards, box[1] - inwards)])
+    enter, leave = faces.min(axis=0).max(axis=1), faces.max(axis=0).min(axis=1)
+    is_box = np.all(box[0] + inwards <= box[1] - inwards)
+    return is_box & (np.maximum(enter, 0.0) <= leave)
 
 
 def off_map(survey: Survey, scene: Scene) -> Float[np.ndarray, " shots"]:

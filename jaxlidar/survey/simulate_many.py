@@ -17,7 +17,8 @@ from pathlib import Path
 from typing import Any
 
 import jax
-from jaxtyping import PRNGKeyArray
+import numpy as np
+from jaxtyping import Int, PRNGKeyArray
 
 from jaxlidar._fields.checks import (
     check_choice,
@@ -40,7 +41,7 @@ from jaxlidar.scenes.scene_parts import SceneParts
 from jaxlidar.sensors.survey import Survey
 from jaxlidar.survey.acquisition import acquisition_of
 from jaxlidar.survey.choose_strategy import choose_strategy
-from jaxlidar.survey.collect import StoredSurvey, SurveyResults, waveforms_in_memory
+from jaxlidar.survey.collect import StoredSurvey, SurveyResults, at_rows, waveforms_in_memory
 from jaxlidar.survey.coverage import (
     OffMapWarning,
     beams_are_narrow,
@@ -48,6 +49,7 @@ from jaxlidar.survey.coverage import (
     is_cut_off,
     off_map,
     off_map_message,
+    shots_on_ground,
 )
 from jaxlidar.survey.results import OPTIONAL_ARRAYS
 from jaxlidar.survey.tiled_scene import TiledSceneStrategy
@@ -71,6 +73,7 @@ def simulate_many(
     shared: bool | None = None,
     truth: bool = False,
     keep: Collection[str] | None = None,
+    beyond: str = "refuse",
 ) -> Waveforms:
     """Simulate the waveforms that all shots of a survey record of one scene.
 
@@ -126,6 +129,9 @@ def simulate_many(
       "energy_budget" and "energy_budget_stderr"; for instance ("recorded", "energy", "stderr", "components")
       for `Waveforms.returns`. The others are neither in memory nor in the file, and their use is refused.
       Default None: all.
+    - `beyond`: "miss" leaves shots off the scene empty: those whose footprints are not on its open terrain.
+      Their waveforms, standard errors and photons are zero, their `ground_position` and truth NaN; the others
+      are those of `survey.within(scene)`. Default "refuse": such shots are refused.
 
     **Returns:** a `Waveforms`.
 
@@ -134,10 +140,11 @@ def simulate_many(
     `UnfollowedLightWarning` where orders that are not followed may add more than `rtol`.
 
     **Raises:** TypeError for arguments of another class, and inside a JAX transformation. ValueError, before
-    any work, for inadmissible arguments, a scene that reaches up to the sensor, shots that do not meet the
-    ground, a receiver whose window opens at the first return, shots that must share light and cannot, and a
-    `path` that is no Zarr store, or has results of another problem, naming what differs. OSError for a `path`
-    that another run uses, or that cannot be written. RuntimeError where the workers of a task die twice.
+    any work, for inadmissible arguments, a scene that reaches up to the sensor, shots off the scene (see
+    `beyond`), a receiver whose window opens at the first return, shots that must share light and cannot, and
+    a `path` that is no Zarr store, or has results of another problem, naming what differs. OSError for a
+    `path` that another run uses, or that cannot be written. RuntimeError where the workers of a task die
+    twice.
 
     **Example:**
 
@@ -169,17 +176,23 @@ def simulate_many(
         raise ValueError(
             "receiver window = 'first return' gives every shot a time axis of its own; admissible is 'fixed'"
         )
+    check_choice("beyond", beyond, ("refuse", "miss"))
     start_time = time.perf_counter()
+    hits = _hits(survey, scene) if beyond == "miss" else None
     if isinstance(scene, SceneParts):
         strategy = TiledSceneStrategy.of(survey, scene, rtol, max_orders, shared, truth, kept_names)
         off_map_fractions, heights = strategy.off_map, strategy.ground_height
     else:
-        strategy = choose_strategy(survey, scene, rtol, max_orders, shared, kept_names=kept_names)
+        shots = survey if hits is None else survey.subset(hits)
+        strategy = choose_strategy(shots, scene, rtol, max_orders, shared, kept_names=kept_names)
         if truth:
             strategy = StrategyWithTruth.around(strategy)
         setup = strategy.setup
         off_map_fractions = off_map(strategy.survey, setup.scene)
         heights = ground_heights(strategy.survey, setup.scene, setup.plan.limits.start_distance)
+        if hits is not None:
+            off_map_fractions = at_rows(hits, len(survey), off_map_fractions, 0.0)
+            heights = at_rows(hits, len(survey), heights, np.nan)
     # Tiles are parts of a stand, whose sides are not looked at.
     may_miss_plants = isinstance(scene, SceneParts) or (scene.canopy is not None and is_cut_off(scene.canopy))
     if may_miss_plants and (message := off_map_message(off_map_fractions)) is not None:
@@ -198,10 +211,11 @@ def simulate_many(
     if path is None:
         results = SurveyResults.in_memory(strategy)
         _trace(results, key, run_tasks, progress)
-        return waveforms_in_memory(results, survey_fields, start_time, **info)
+        return waveforms_in_memory(results, survey_fields, hits, start_time, **info)
 
     # Digests of all that the waveforms depend on: results of another problem are neither used nor
     # overwritten.
+    options = {} if hits is None else {"beyond": beyond}
     scene_content = (scene, strategy.digests) if isinstance(strategy, TiledSceneStrategy) else scene
     problem = fingerprint(
         {
@@ -213,13 +227,14 @@ def simulate_many(
             "shared": strategy.info()["shared"],
             "truth": bool(truth),
             "keep": kept_names,
+            **options,
         }
     )
     arguments = {"rtol": rtol, "max_orders": max_orders, "shared": shared, "truth": truth}
-    arguments |= {} if keep is None else {"keep": kept_names}
+    arguments |= options | ({} if keep is None else {"keep": kept_names})
     case = None if isinstance(scene, SceneParts) else _case(survey, scene, key, arguments)
     with open_store(path, problem) as store:
-        stored_survey = StoredSurvey(store, strategy, survey_fields, case)
+        stored_survey = StoredSurvey(store, strategy, survey_fields, hits, case)
         try:
             _trace(stored_survey.results, key, run_tasks, progress)
         except KeyboardInterrupt as error:
@@ -227,6 +242,17 @@ def simulate_many(
             raise
         stored_survey.finish(start_time, **info)
     return Waveforms.open(path)
+
+
+def _hits(survey: Survey, scene: Scene | SceneParts) -> Int[np.ndarray, " hits"] | None:
+    """Return the numbers of the shots that lie on a scene; None where all do. **Raises:** ValueError."""
+    if isinstance(scene, SceneParts):
+        raise ValueError("beyond = 'miss' is given with SceneParts; admissible is 'refuse', or a Scene")
+    is_on_ground = shots_on_ground(survey, scene)
+    if not is_on_ground.any():
+        # With a message that has both extents.
+        survey.within(scene)
+    return None if is_on_ground.all() else np.flatnonzero(is_on_ground)
 
 
 def _kept_names(keep: Collection[str] | None) -> tuple[str, ...]:
