@@ -40,6 +40,7 @@ waveform_html = RegisteredFunction("the figure of a waveform in a notebook", "ja
 detect_returns = RegisteredFunction("detecting discrete returns", "jaxlidar.survey.waveforms")
 true_returns = RegisteredFunction("the list of true echoes", "jaxlidar.survey.waveforms")
 survey_lines = RegisteredFunction("describing the strategy of a survey", "jaxlidar.survey.choose_strategy")
+common_crs = RegisteredFunction("comparing coordinate reference systems", "jaxlidar.io.coordinates")
 shots_within = RegisteredFunction("clipping a survey to a scene", "jaxlidar.survey.coverage")
 simulate_survey = RegisteredFunction("simulating a survey", "jaxlidar.survey.simulate_many")
 

@@ -24,6 +24,7 @@ from jax import lax
 from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Float
 
+from jaxlidar._registry import common_crs
 from jaxlidar._text import number_text
 
 # Numbers as users give them: one, an array, or rows of them in lists and tuples.
@@ -41,6 +42,14 @@ def as_scalar(x: ArrayLike, field: str = "value") -> Float[Array, ""]:
     if a.size != 1:
         raise ValueError(f"{field} has shape {a.shape}; admissible is one number")
     return a.reshape(()) if a.ndim else a
+
+
+def crs_name(x: Any) -> str | None:
+    """Convert a field `crs`: the name of a map in metres, such as "EPSG:32633", its EPSG number, or None.
+
+    **Raises:** ValueError for a system that is not known or not in metres; TypeError for other objects.
+    """
+    return common_crs({"crs": x})
 
 
 def as_optional_scalar(x: ArrayLike | None, field: str = "value") -> Float[Array, ""] | None:

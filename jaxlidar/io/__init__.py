@@ -21,6 +21,7 @@ from jaxlidar.io.lvis import read_lvis_l1b, read_lvis_l2
 from jaxlidar.io.meshes import read_mesh
 from jaxlidar.io.neon import read_neon
 from jaxlidar.io.netcdf import read_case, save
+from jaxlidar.io.projection import to_crs
 from jaxlidar.io.pulsewaves import read_pulsewaves
 from jaxlidar.io.qsm import read_qsm
 from jaxlidar.io.rasters import write_raster
@@ -61,6 +62,7 @@ __all__ = [
     "read_vox",
     "save",
     "stack_shots",
+    "to_crs",
     "write_case",
     "write_gedi_l1b",
     "write_las",

@@ -19,7 +19,7 @@ import json
 import math
 import struct
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -27,6 +27,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from jaxlidar._fields.checks import check_kind, warn_user
+from jaxlidar._registry import common_crs
 from jaxlidar.io.checks import TWO_WAY_METRES_PER_NS, TWO_WAY_TOLERANCE, required_for
 
 # Numbers of the variable length records of LAS and PulseWaves files that declare the system: GeoTIFF keys
@@ -85,6 +86,9 @@ GEOGRAPHIC, GEOGRAPHIC_3D = "EPSG:4326", "EPSG:4979"
 _COARSEST_ACCURACY = 0.1
 # No unit of length has this many metres; a degree, or a gradian, of latitude has some 1e5.
 _MIN_METRES_PER_ANGLE = 1e4
+# Longest text of a system that messages quote: a code, but no WKT. Confidence, of 100, of PROJ that a system
+# is that of a code: names of a few parts may differ.
+_LONGEST_CODE, _SURE = 40, 70
 # Elevations in m from which light returns: from the deepest trench to the highest clouds.
 MIN_ELEVATION, MAX_ELEVATION = -12_000.0, 20_000.0
 
@@ -128,6 +132,11 @@ class CoordinateSystem:
             return self._with_same_units(self.crs.to_wkt("WKT1_GDAL"))
         except pyproj.exceptions.CRSError:
             return self.crs.to_wkt()
+
+    @property
+    def map_name(self) -> str | None:
+        """The name of the same map in metres; None where none is declared, or its unit is not known."""
+        return self.in_metres().text if self.kind == "map" and self.horizontal is not None else None
 
     def _with_same_units(self, text: str) -> str:
         """Return the text, or WKT of version 2 where the text does not keep the unit of each axis."""
@@ -270,6 +279,64 @@ def metric_system(field: str, name: str) -> CoordinateSystem:
             f"{field} = {name!r} is not in metres; admissible is a projected system, such as EPSG:32633"
         )
     return system
+
+
+@functools.lru_cache
+def _map_in_metres(field: str, name: str) -> CoordinateSystem:
+    return metric_system(field, name)
+
+
+@common_crs.register
+def common_system(names: Mapping[str, Any]) -> str | None:
+    """Return the name of the one coordinate reference system of all, by field; None where none has one.
+
+    One with a system of heights agrees with one without. An EPSG number becomes a name.
+
+    **Raises:** ValueError for two systems, naming both, for one that is not known and one that is not in
+    metres; TypeError for what is no name; ImportError where pyproj is not installed.
+    """
+    first_field = ""
+    first: str | None = None
+    for field, name in names.items():
+        if name is None:
+            continue
+        name = f"EPSG:{name}" if type(name) is int else name
+        check_kind(field, name, str, "the name of a coordinate reference system, its EPSG number, or None")
+        system = _map_in_metres(field, name)
+        if first is None or name == first:
+            first_field, first = first_field or field, name
+            continue
+        first_system = _map_in_metres(first_field, first)
+        (level, heights), (other_level, other_heights) = map(level_and_heights, (first_system, system))
+        if not (_are_equal(level, other_level) and _are_equal(heights, other_heights)):
+            raise ValueError(
+                f"{field} is in {_short_name(system)}, {first_field} in {_short_name(first_system)}; "
+                "admissible is one coordinate reference system: jaxlidar.io.to_crs transforms points, "
+                "inventories and trajectories"
+            )
+        first = name if heights is None else first
+    return first
+
+
+def _short_name(system: CoordinateSystem) -> str:
+    text = system.text or ""
+    return text if len(text) <= _LONGEST_CODE else system.name
+
+
+def level_and_heights(system: CoordinateSystem) -> tuple[Any, Any]:
+    """Return the `pyproj.CRS` of x and y, and that of heights; None for one that is not declared."""
+    crs = system.crs
+    parts = [part.source_crs if part.is_bound else part for part in crs.sub_crs_list or [crs]]
+    level, heights = ([part for part in parts if part.is_vertical == is_up] for is_up in (False, True))
+    return (level or [None])[0], (heights or [None])[0]
+
+
+def _are_equal(a: Any, b: Any) -> bool:
+    """Return True for systems that are the same, by definition or code, and where one is not known."""
+    if a is None or b is None or a.equals(b, ignore_axis_order=True):
+        return True
+    code = a.to_authority(min_confidence=_SURE)
+    return code is not None and code == b.to_authority(min_confidence=_SURE)
 
 
 def transform(

@@ -135,6 +135,7 @@ def read_dem(
         origin=grid.origin,
         reflectance=reflectance,
         law=law,
+        crs=grid.map_name,
     )
     return DemRead(terrain, grid.crs, int(missing.sum()))
 
@@ -144,13 +145,15 @@ class HeightGrid(NamedTuple):
 
     - `heights`: (nx, ny) m, NaN where the file has no data.
     - `origin`: (2,) position of the south-west node, and `spacing`: (2,) of the nodes, m.
-    - `crs`: the coordinate reference system of these numbers, or None.
+    - `crs`: the coordinate reference system of these numbers, or None. `map_name`: the same, unless the unit
+      of the file is not known.
     """
 
     heights: Float[np.ndarray, "nx ny"]
     origin: Float[np.ndarray, " 2"]
     spacing: Float[np.ndarray, " 2"]
     crs: str | None
+    map_name: str | None
 
 
 def read_grid(
@@ -196,7 +199,9 @@ def read_grid(
             f"{path}: cells of {spacing.tolist()} at {origin.tolist()} have the slopes of a grid in degrees; "
             "project it to metres, or give its coordinate reference system as crs="
         )
-    return HeightGrid(heights, origin + spacing * (x.start, y.start), spacing, system.in_metres().text)
+    return HeightGrid(
+        heights, origin + spacing * (x.start, y.start), spacing, system.in_metres().text, system.map_name
+    )
 
 
 def _height_unit(path: Path, unit: str | None, system: CoordinateSystem, is_argument: bool) -> float:

@@ -2,11 +2,12 @@
 
 import os
 
+from jaxlidar._fields.checks import crs_name
 from jaxlidar.io.text import read_lines, split_cells
 from jaxlidar.plants.inventory import Inventory, inventory_of_table
 
 
-def read_inventory(path: str | os.PathLike[str]) -> Inventory:
+def read_inventory(path: str | os.PathLike[str], *, crs: str | int | None = None) -> Inventory:
     r"""Read the trees of a forest inventory from a text table with a row for each tree.
 
     **Arguments:**
@@ -16,12 +17,14 @@ def read_inventory(path: str | os.PathLike[str]) -> Inventory:
       leaf_area, in any order and case. Lengths are in m, or in the unit at the end of the name, as in
       "dbh [cm]" or "dbh_cm"; leaf areas in m2. Cells of diameter and crown may be empty. Further columns are
       not read.
+    - `crs`: coordinate reference system of x and y, in metres, such as "EPSG:32633", or its EPSG number.
+      Default None: not known.
 
     **Returns:** an `Inventory`, for `jaxlidar.stand_from_inventory`.
 
     **Raises:** FileNotFoundError where there is no such file. ValueError, naming the file and the line, for
     columns that are missing or ambiguous, units that are not known, rows of another length, and cells that
-    are no numbers or outside of their range.
+    are no numbers or outside of their range; and for a `crs` that is not known or not in metres.
 
     **Example:**
 
@@ -46,6 +49,6 @@ def read_inventory(path: str | os.PathLike[str]) -> Inventory:
     columns = {name: [row[i] for row in rows] for i, name in enumerate(names)}
     place_of = [f"{path}: line {number}" for number in numbers]
     try:
-        return inventory_of_table(columns, place_of.__getitem__)
+        return inventory_of_table(columns, place_of.__getitem__)._replace(crs=crs_name(crs))
     except ValueError as error:
         raise error if str(error).startswith(str(path)) else ValueError(f"{path}: line 1: {error}") from None

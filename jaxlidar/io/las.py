@@ -14,7 +14,13 @@ from jaxtyping import ArrayLike, Num
 
 from jaxlidar._fields.checks import as_numpy, check_number, check_range, check_shape
 from jaxlidar.io.checks import MAX_COORDINATE, existing_file, required_for
-from jaxlidar.io.coordinates import WKT_RECORD, CoordinateSystem, check_elevations, metric_system
+from jaxlidar.io.coordinates import (
+    WKT_RECORD,
+    CoordinateSystem,
+    check_elevations,
+    common_system,
+    metric_system,
+)
 from jaxlidar.io.files import atomic_write
 from jaxlidar.io.las_header import PROJECTION_USER, LasHeader, read_header
 from jaxlidar.io.laz import decompress_points
@@ -57,7 +63,8 @@ def read_las(path: str | os.PathLike[str], *, scale: float | None = None) -> Poi
       its coordinate reference system, in which heights without a unit have that of x and y; metres in a file
       that declares none.
 
-    **Returns:** a `PointCloud`. Its `dropped` counts points as "noise" and "withheld".
+    **Returns:** a `PointCloud`. Its `dropped` counts points as "noise" and "withheld". Its `crs` is the
+    system that the file declares, in metres; None with a `scale`.
 
     **Raises:** FileNotFoundError where there is no such file. ImportError without laspy, or without lazrs
     for LAZ. ValueError, naming the file and the place (for points the record), where it is damaged, cut
@@ -87,7 +94,7 @@ def read_las(path: str | os.PathLike[str], *, scale: float | None = None) -> Poi
     lengths = system.lengths(f"{path}: header") if scale is None else (scale, scale)
     position = cloud.position * [lengths[0], lengths[0], lengths[1]]
     check_elevations(f"{path}: points", position[:, 2])
-    return cloud._replace(position=position)
+    return cloud._replace(position=position, crs=system.map_name if scale is None else None)
 
 
 def read_stored_points(
@@ -291,14 +298,23 @@ class LasWriter:
         scan_angle: Num[ArrayLike, "..."] | None = None,
         point_source: Num[ArrayLike, "..."] | None = None,
         extra: Mapping[str, tuple[str, Num[ArrayLike, "..."]]] | None = None,
+        crs: str | None = None,
     ) -> None:
         """Write a part: one point or more, with the arguments of `write_las`.
 
+        A writer without a `crs` takes that of its first part.
+
         **Raises:** as `write_las`; ValueError outside of a `with` statement, and for a part whose extra
-        numbers or kind of GPS time are other ones than those of the first.
+        numbers, kind of GPS time or `crs` are other ones than those of the first.
         """
         if self._draft is None:
             raise ValueError(f"{self.path} is not open; admissible is with LasWriter(...) as file")
+        if crs is not None:
+            written = None if self._system is None else self._system.text
+            if written is None and self._header is not None:
+                raise ValueError(f"crs = {crs!r} of a part; the first part has none: give it to LasWriter")
+            common = common_system({"LasWriter": written, "the part": crs})
+            self._system = metric_system("crs", common) if common and written is None else self._system
         coordinates = as_numpy(position, "position")
         n = len(coordinates)
         if intensity is not None:

@@ -14,6 +14,7 @@ from jaxlidar._fields.columns import warn_unread_columns
 from jaxlidar.io.checks import MAX_COORDINATE
 from jaxlidar.io.coordinates import (
     GEOGRAPHIC,
+    common_system,
     directions_of_north,
     metric_system,
     system_of_name,
@@ -89,7 +90,8 @@ def read_trajectory(path: str | os.PathLike[str], *, crs: str | None = None) -> 
       latitude, on WGS 84, are projected to it, and headings, which are from true north, turned to the map's;
       so is a true heading beside x and y. Default None: the file has x and y, and headings are the map's.
 
-    **Returns:** a `Trajectory`, in the sense of roll, pitch and yaw that it states.
+    **Returns:** a `Trajectory`, in the sense of roll, pitch and yaw that it states, with the `crs` of the
+    argument or the comment.
 
     **Raises:** FileNotFoundError where there is no such file. ValueError, naming the file and the line, for
     columns that are missing, or that several columns may be; times that are UTC, local or of the day, unless
@@ -161,9 +163,9 @@ def read_trajectory(path: str | os.PathLike[str], *, crs: str | None = None) -> 
             if any(column.is_declared for column in angles):
                 # Angles whose unit the file names are what they are.
                 warnings.simplefilter("ignore", UnitWarning)
-            return Trajectory(
-                values["time"], position, values.get("roll", 0.0), values.get("pitch", 0.0), yaw
-            )
+            map_name = crs if is_geographic else common_system({"crs": crs, str(location): declared_crs})
+            roll, pitch = values.get("roll", 0.0), values.get("pitch", 0.0)
+            return Trajectory(values["time"], position, roll, pitch, yaw, map_name)
     except ValueError as error:
         raise ValueError(f"{path}: line {numbers[0]} and following: {error}") from error
 
@@ -224,7 +226,8 @@ def _declared_in_comments(
     """Return the metres per unit of columns of lengths, and the system, that comments of a file declare.
 
     Comments are as "# units: feet" and "# crs: EPSG:2263". A unit beside the name of a column goes before
-    them. A system of the Earth's own, as EPSG:4326, is that of longitude and latitude, and is not returned.
+    them. A system of the Earth's own, as EPSG:4326, is that of longitude and latitude, and is not returned;
+    that of x and y is returned in metres.
 
     **Raises:** ValueError for several units or systems, a unit beside a system of another, and degrees where
     the columns are x and y.
@@ -244,6 +247,7 @@ def _declared_in_comments(
             crs = declared["crs"][1] if system.kind == "map" else None
         else:
             horizontal, vertical = system.lengths(declared["crs"][0])
+            crs = system.map_name
     if "units" in declared:
         location, text = declared["units"]
         unit = unit_length(location, text)

@@ -1,5 +1,6 @@
 """Reader of voxel maps of AMAPVox and HELIOS++ (.vox text files)."""
 
+import dataclasses
 import math
 import os
 import re
@@ -12,7 +13,7 @@ from jaxtyping import Float
 
 from jaxlidar._fields.checks import check_choice, check_range, warn_user
 from jaxlidar.io.checks import MAX_COORDINATE, FileWarning, column_index, max_unpacked_size
-from jaxlidar.io.coordinates import metric_system, unit_length
+from jaxlidar.io.coordinates import common_system, unit_length
 from jaxlidar.io.text import parse_integer, parse_number, read_lines, split_cells
 from jaxlidar.optics.leaf_angles import LeafAngles
 from jaxlidar.scenes.voxels import VoxelMap
@@ -109,7 +110,7 @@ def read_vox(
     check_range("fill", fill, 0.0)
     path, lines = read_lines(path)
     header, column_line = _read_header(path, lines)
-    _check_units(path, header)
+    crs = _checked_system(path, header)
     kind, line = header.get("type", ("", 0))
     if (material := _MATERIAL_OF_TYPE.get(kind.lower(), name)) != name:
         raise ValueError(
@@ -177,7 +178,7 @@ def read_vox(
         voxels = VoxelMap.from_lad(
             densities, voxel_size=grid.edges, origin=grid.origin, leaf_angles=angles or "spherical"
         )
-    return VoxelsRead(voxels, dropped)
+    return VoxelsRead(dataclasses.replace(voxels, crs=crs), dropped)
 
 
 class _VoxelRow(NamedTuple):
@@ -250,14 +251,19 @@ def _read_header(path: Path, lines: list[str]) -> tuple[dict[str, tuple[str, int
     raise ValueError(f"{path}: line {len(lines)}: the file ends where the names of the columns belong")
 
 
-def _check_units(path: Path, header: dict[str, tuple[str, int]]) -> None:
-    """Refuse a header that names another unit than the metre, or a system of coordinates in another one."""
+def _checked_system(path: Path, header: dict[str, tuple[str, int]]) -> str | None:
+    """Return the system of coordinates that a header names; refuse another unit than the metre.
+
+    **Raises:** ValueError, naming the file and the line, also for two systems.
+    """
+    names = {}
     for key, (text, line) in header.items():
         location = f"{path}: line {line}: {key}"
         if key in ("unit", "units") and unit_length(location, text) != 1.0:
             raise ValueError(f"{location} = {text}; read are voxels in metres")
         if key in ("crs", "srs", "epsg"):
-            metric_system(location, f"EPSG:{text}" if text.isdigit() else text)
+            names[location] = f"EPSG:{text}" if text.isdigit() else text
+    return common_system(names)
 
 
 def _read_grid(path: Path, header: dict[str, tuple[str, int]]) -> _VoxelGrid:

@@ -55,6 +55,7 @@ class Inventory(NamedTuple):
     - `diameter`, `crown`: (n,) diameters of stem and crown, m, NaN where they were not measured; None where
       the table has none.
     - `leaf_area`: (n,) one-sided leaf areas of the trees, m2; None where the table has none.
+    - `crs`: coordinate reference system of `x` and `y`, such as "EPSG:32633"; None where it is not known.
 
     **Example:**
 
@@ -73,6 +74,7 @@ class Inventory(NamedTuple):
     diameter: Float[np.ndarray, " n"] | None = None
     crown: Float[np.ndarray, " n"] | None = None
     leaf_area: Float[np.ndarray, " n"] | None = None
+    crs: str | None = None
 
 
 def stand_from_inventory(
@@ -126,8 +128,9 @@ def stand_from_inventory(
     trees = inventory if isinstance(inventory, Inventory) else inventory_of_table(inventory)
     if isinstance(inventory, Inventory):
         # Checked as any other table.
-        present = {name: column for name, column in inventory._asdict().items() if column is not None}
-        trees = inventory_of_table(present)
+        columns = inventory._replace(crs=None)._asdict().items()
+        trees = inventory_of_table({name: column for name, column in columns if column is not None})
+        trees = trees._replace(crs=inventory.crs)
     if (leaf_area_index is None) != (area is None):
         raise ValueError("leaf_area_index and area belong together: give both or neither")
     if leaf_area_index is not None and trees.leaf_area is not None:
@@ -148,6 +151,7 @@ def stand_from_inventory(
         copies,
         turn_rng.uniform(0.0, 360.0, n),
         _scales(trees, grown, copies),
+        crs=trees.crs,
     )
     if leaf_area_index is not None and area is not None:
         return stand.with_leaf_area_index(leaf_area_index, area)
@@ -210,7 +214,7 @@ def inventory_of_table(table: Any, place_of: Callable[[int], str] = "row {}".for
             "DataFrame, or what jaxlidar.io.read_inventory returns"
         )
     table_names = [str(name) for name in table.keys()]  # noqa: SIM118
-    names, units = _columns_in_use(table_names)
+    names, units = columns_in_use(table_names)
     missing = {quantity: known for quantity, known in _NAMES.items() if quantity not in names}
     warn_unread_columns("the inventory", [n for n in table_names if n not in names.values()], missing)
     labels = {str(label): label for label in table.keys()}  # noqa: SIM118
@@ -243,7 +247,7 @@ def inventory_of_table(table: Any, place_of: Callable[[int], str] = "row {}".for
     return inventory
 
 
-def _columns_in_use(names: list[str]) -> tuple[dict[str, str], dict[str, float]]:
+def columns_in_use(names: list[str]) -> tuple[dict[str, str], dict[str, float]]:
     """Return the names of the columns by quantity, and their units in m or m2.
 
     **Raises:** ValueError for columns that are missing or ambiguous, and units that are not known.

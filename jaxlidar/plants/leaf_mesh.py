@@ -138,7 +138,8 @@ def leaf_mesh(
     else:
         clouds = _in_stand(voxels, leaf_area, clump_leaf_area, shape, random)
     angles = LeafAngles.named("spherical") if angles is None else angles
-    surfaces = tuple(_surface(leaves, shape, angles, optics, random) for leaves in clouds)
+    crs = None if isinstance(voxels, Tree) else voxels.crs
+    surfaces = tuple(_surface(leaves, shape, angles, optics, random, crs) for leaves in clouds)
     return surfaces if isinstance(voxels, Stand) else surfaces[0]
 
 
@@ -240,7 +241,12 @@ def _in_stand(
 
 
 def _surface(
-    leaves: _Leaves, shape: str, angles: LeafAngles, optics: tuple[Any, Any], random: np.random.Generator
+    leaves: _Leaves,
+    shape: str,
+    angles: LeafAngles,
+    optics: tuple[Any, Any],
+    random: np.random.Generator,
+    crs: str | None,
 ) -> MeshSurface:
     """Return the surface of leaves with inclinations of a distribution, random azimuths and turns."""
     n = len(leaves.centre)
@@ -259,5 +265,5 @@ def _surface(
     n_corners = corners.shape[1]
     faces = np.arange(n)[:, None, None] * n_corners + leaf_faces(n_corners)
     mesh = Mesh(corners.reshape(-1, 3), faces.reshape(-1, 3), materials=("leaf",))
-    reflectance, transmittance = optics
-    return MeshSurface(mesh, {"leaf": reflectance}, {"leaf": transmittance}, instances=leaves.instances)
+    reflectance, transmittance = ({"leaf": a} for a in optics)
+    return MeshSurface(mesh, reflectance, transmittance, instances=leaves.instances, crs=crs)

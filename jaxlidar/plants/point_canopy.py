@@ -36,6 +36,7 @@ more than a slope would is not ground (Zhang et al. 2003; Pingel et al. 2013).
 Remote Sens. 41, 872.
 """
 
+import dataclasses
 from typing import NamedTuple
 
 import numpy as np
@@ -162,6 +163,7 @@ def canopy_from_points(
         surface = _fitted_heights(position[is_ground], columns.reshape(-1, 2), spacing)
         surface = surface.reshape(grid.shape[:2])
         terrain = _terrain(position[is_ground], low[:2], position.max(axis=0)[:2], size[:2], reflectance)
+        terrain = dataclasses.replace(terrain, crs=points.crs)
     ground_layer = np.clip(
         np.floor((surface - grid.low[2]) / size[2] + _MIN_HEIGHT).astype(int), 0, grid.shape[2] - 1
     )
@@ -177,7 +179,7 @@ def canopy_from_points(
     smoothed = (entered * probability + 0.5) / (entered + 1.0)
     stderr = np.sqrt(smoothed / ((1.0 - smoothed) * (entered + 1.0))) * unit_density
     voxels = VoxelMap.from_lad(density, voxel_size=size, origin=tuple(grid.low), leaf_angles=leaf_angles)
-    return PointCanopy(voxels, stderr, terrain)
+    return PointCanopy(dataclasses.replace(voxels, crs=points.crs), stderr, terrain)
 
 
 def _check_points(points: PointCloud) -> None:

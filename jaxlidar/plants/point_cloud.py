@@ -18,6 +18,8 @@ class PointCloud(NamedTuple):
       not known. Default None.
     - `gps_time`: (n,) s, the same for all returns of a pulse; None where it is not known. Default None.
     - `source`: (n,) number of the flight line; None where it is not known. Default None.
+    - `crs`: coordinate reference system of `position`, such as "EPSG:32633"; None where it is not known.
+      Default None.
 
     **Example:**
 
@@ -38,3 +40,4 @@ class PointCloud(NamedTuple):
     scan_angle: Float[np.ndarray, " n"] | None = None
     gps_time: Float[np.ndarray, " n"] | None = None
     source: Int[np.ndarray, " n"] | None = None
+    crs: str | None = None

@@ -7,7 +7,8 @@ from typing import Any, final, overload
 import numpy as np
 from jaxtyping import Float, Int
 
-from jaxlidar._fields.checks import Numbers, check_kind, check_number, check_range, check_shape
+from jaxlidar._fields.checks import Numbers, check_kind, check_number, check_range, check_shape, crs_name
+from jaxlidar._registry import common_crs
 from jaxlidar.plants.tree import Tree
 from jaxlidar.scenes.terrain import Terrain
 
@@ -32,6 +33,7 @@ class Stand(Sequence[Tree]):
       1.
     - `leaf_area`: one-sided leaf area of every clump in m2, 0 or more: one number, or (n,), one for each
       tree. Default None: not stated.
+    - `crs`: coordinate reference system of `position`, as that of `Terrain`. Default None: not known.
 
     **Raises:** ValueError for arrays of other shapes, for no individual or no tree, for numbers of
     individuals that there are not, and for values outside the ranges above; TypeError for individuals that
@@ -53,6 +55,7 @@ class Stand(Sequence[Tree]):
     azimuth: Float[np.ndarray, " n"]
     scale: Float[np.ndarray, "n 3"]
     leaf_area: Float[np.ndarray, " n"] | None
+    crs: str | None
 
     def __init__(
         self,
@@ -62,6 +65,7 @@ class Stand(Sequence[Tree]):
         azimuth: Numbers | None = None,
         scale: Numbers | None = None,
         leaf_area: Numbers | None = None,
+        crs: str | int | None = None,
     ):
         check_kind("individuals", individuals, Tree | Sequence, "a Tree or several")
         trees = [individuals] if isinstance(individuals, Tree) else list(individuals)
@@ -99,7 +103,8 @@ class Stand(Sequence[Tree]):
         ):
             check_shape(name, array, shape)
         # Each individual is scaled and turned about its base.
-        values = (tuple(tree.translated(-tree.base) for tree in trees), place, number, turn, factors, area)
+        copied = tuple(tree.translated(-tree.base) for tree in trees)
+        values = (copied, place, number, turn, factors, area, crs_name(crs))
         for name, value in zip(self.__dataclass_fields__, values):
             object.__setattr__(self, name, value)
 
@@ -135,6 +140,7 @@ class Stand(Sequence[Tree]):
             np.concatenate([stand.azimuth for stand in alike]),
             np.concatenate([stand.scale for stand in alike]),
             np.concatenate(areas) if areas else None,
+            common_crs({f"stands[{i}]": stand.crs for i, stand in enumerate(alike)}),
         )
 
     def __len__(self) -> int:
@@ -156,6 +162,7 @@ class Stand(Sequence[Tree]):
                 self.azimuth[index],
                 self.scale[index],
                 area,
+                self.crs,
             )
         tree = self.individuals[self.individual[index]]
         scaled = tree.scaled(self.scale[index])
@@ -255,11 +262,13 @@ class Stand(Sequence[Tree]):
 
         **Returns:** a `Stand`.
 
-        **Raises:** ValueError for trees that stand off the terrain; TypeError for an object that is none.
+        **Raises:** ValueError for trees that stand off the terrain, and one with another `crs`; TypeError for
+        an object that is none.
         """
         check_kind("terrain", terrain, Terrain, "a Terrain")
+        crs = common_crs({"stand": self.crs, "terrain": terrain.crs})
         lift = np.asarray(terrain.height_at(self.position[:, 0], self.position[:, 1]), float)
-        return self._with(position=self.position + lift[:, None] * [0.0, 0.0, 1.0])
+        return self._with(position=self.position + lift[:, None] * [0.0, 0.0, 1.0], crs=crs)
 
     def _with(self, **changes: Any) -> "Stand":
         """Return the stand with other values of some fields."""

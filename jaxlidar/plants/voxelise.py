@@ -23,6 +23,7 @@ neighbouring voxels is uncertain: a voxel that the side of a trunk cuts through 
 volume with 8 samples (root mean square, measured).
 """
 
+import dataclasses
 from collections.abc import Iterable, Iterator, Sequence
 from typing import NamedTuple
 
@@ -122,7 +123,7 @@ def voxelise(
         if leaf_area is not None:
             check_number("leaf_area", leaf_area, 0.0)
         areas = trees.leaf_area if leaf_area is None else np.full(len(trees), float(leaf_area))
-        return _voxelise_stand(
+        voxels = _voxelise_stand(
             trees,
             areas,
             voxel_size,
@@ -132,6 +133,7 @@ def voxelise(
             shape=shape,
             progress=progress,
         )
+        return dataclasses.replace(voxels, crs=trees.crs)
     trees = [trees] if isinstance(trees, Tree) else list(trees)
     size = voxel_edges(voxel_size)
     check_choice("wood", wood, ("volume", "surface"))

@@ -28,6 +28,7 @@ from jaxlidar._fields.checks import (
     check_shape,
     concrete,
     concrete_array,
+    crs_name,
     fixed_array,
     has_tracers,
     kind_of,
@@ -183,6 +184,8 @@ class MeshSurface(eqx.Module):
     - `two_sided`: False if light meets triangles from their front side only, and passes them from behind.
       Default True.
     - `instances`: `MeshInstances`, which place copies of the mesh. Default None: the mesh as it is.
+    - `crs`: coordinate reference system in which the mesh, or its copies, are placed, as that of `Terrain`.
+      Default None: not known.
 
     Its name in `Waveform.components` is "mesh", or "mesh:NAME" of each material where optics are a dict.
     Arrays of indices are part of a scene: differentiate with `equinox.filter_grad`, or by a number from which
@@ -217,6 +220,7 @@ class MeshSurface(eqx.Module):
     materials: tuple[str, ...] = eqx.field(static=True)
     two_sided: bool = eqx.field(static=True)
     n_triangles: int = eqx.field(static=True)
+    crs: str | None = eqx.field(static=True)
     # That of a scene with periodic sides, where what repeats is left out of a simulation; else None.
     period: Float[Array, "2"] | None
 
@@ -230,7 +234,9 @@ class MeshSurface(eqx.Module):
         law: AbstractLaw = Lambertian(),  # noqa: B008 - laws are immutable
         two_sided: bool = True,
         instances: MeshInstances | None = None,
+        crs: str | int | None = None,
     ):
+        self.crs = crs_name(crs)
         vertices, faces, group, names = _mesh_arrays(mesh)
         check_kind("law", law, AbstractLaw, "a law of reflection, such as Lambertian()")
         if isinstance(law, AbstractMirror):

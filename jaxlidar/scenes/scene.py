@@ -13,6 +13,7 @@ from jaxtyping import Array, Float
 
 from jaxlidar._fields.checks import check_kind, concrete, concrete_array, has_tracers, kind_of
 from jaxlidar._fields.ranges import Range
+from jaxlidar._registry import common_crs
 from jaxlidar._text import object_text
 from jaxlidar._vectors import FAR
 from jaxlidar.scenes.atmosphere import Atmosphere
@@ -65,10 +66,10 @@ class Scene(eqx.Module):
       opposite one. Default ().
 
     **Raises:** TypeError for an argument of the wrong type; ValueError for a plate in the plane of the
-    ground, of another plate, of a triangle or of a cell of the terrain, for a canopy with periodic sides
-    over terrain of another period, for one that lies below the terrain as a whole, for meshes that are wider
-    than the period of a canopy or terrain with periodic sides, with which they repeat, and for meshes most of
-    whose triangles follow the terrain and cross it.
+    ground, of another plate, of a triangle or of a cell of the terrain, for a canopy with periodic sides over
+    terrain of another period, for parts whose `crs` differ, for a canopy that lies below the terrain as a
+    whole, for meshes that are wider than the period of a canopy or terrain with periodic sides, with which
+    they repeat, and for meshes most of whose triangles follow the terrain and cross it.
 
     **Warns:** `MisplacedCanopyWarning` for plants below the terrain, or far above it.
 
@@ -101,15 +102,17 @@ class Scene(eqx.Module):
         ):
             check_kind(field, getattr(self, field), kind | None, admissible)
         check_kind("plates", self.plates, tuple, "a tuple, as in (plate,)")
+        check_kind("meshes", self.meshes, tuple, "a tuple, as in (mesh,)")
+        for mesh in self.meshes:
+            check_kind("one of meshes", mesh, MeshSurface, "a MeshSurface, as in MeshSurface(mesh)")
+        # Two systems are refused before plants seem to lie far off the terrain.
+        _ = self.crs
         if self.canopy is not None and isinstance(self.ground, Terrain):
             check_periods(self.canopy, self.ground)
             check_relative_height(self.canopy, self.ground)
         for plate in self.plates:
             if not isinstance(plate, AbstractSheet):
                 raise TypeError(f"plates has {kind_of(plate)}; admissible is a tuple of Plate")
-        check_kind("meshes", self.meshes, tuple, "a tuple, as in (mesh,)")
-        for mesh in self.meshes:
-            check_kind("one of meshes", mesh, MeshSurface, "a MeshSurface, as in MeshSurface(mesh)")
         if self.meshes:
             check_mesh_widths(self.meshes, self.period)
         names = (() if self.ground is None else ("the ground",)) + tuple(
@@ -173,6 +176,13 @@ class Scene(eqx.Module):
                     f"meshes[{n}] follows the terrain, up to {-low:.2g} m below and {high:.2g} m above it: "
                     "light would meet patches of both; give one of them, or lift the mesh above the terrain"
                 )
+
+    @property
+    def crs(self) -> str | None:
+        """Coordinate reference system of terrain, voxel map and meshes; None if unknown."""
+        ground = {"ground": self.ground.crs} if isinstance(self.ground, Terrain) else {}
+        voxels = {} if self.canopy is None else {"canopy": self.canopy.voxels.crs}
+        return common_crs(ground | voxels | {f"meshes[{i}]": mesh.crs for i, mesh in enumerate(self.meshes)})
 
     @property
     def gap(self) -> Float[Array, ""] | None:

@@ -32,6 +32,7 @@ from jaxlidar._fields.checks import (
     concrete,
     concrete_array,
     coordinates,
+    crs_name,
 )
 from jaxlidar._fields.ranges import FRACTION, Range, check_ranges
 from jaxlidar._vectors import normalise
@@ -90,6 +91,8 @@ class Terrain(AbstractGround):
       "periodic": the terrain repeats without end, node nx being node 0 again; a canopy with periodic sides
       above it must have the same period. Default "open".
     - `relief`: False for the plane of best fit in place of the heights. Default True.
+    - `crs`: coordinate reference system of the map, in metres, such as "EPSG:32633", or its EPSG number;
+      `jaxlidar.io.read_dem` gives it. Default None: not known.
 
     **Raises:** ValueError for fewer nodes than 2 x 2, a spacing that is not positive, a reflectance outside
     [0, 1], a raster of another shape than the heights, values that are not finite, and a mirror; TypeError
@@ -115,6 +118,7 @@ class Terrain(AbstractGround):
     law: AbstractLaw = Lambertian()
     sides: str = eqx.field(static=True, default="open")
     relief: bool = eqx.field(static=True, default=True)
+    crs: str | None = eqx.field(static=True, converter=crs_name, default=None)
 
     ranges: ClassVar = {
         "heights": Range(),

@@ -25,9 +25,11 @@ from jaxlidar._fields.checks import (
     check_shape,
     concrete,
     coordinates,
+    crs_name,
     warn_units,
 )
 from jaxlidar._fields.ranges import Range, check_ranges
+from jaxlidar._registry import common_crs
 from jaxlidar._text import object_text
 from jaxlidar.optics.leaf_angles import LeafAngles
 from jaxlidar.scenes.terrain import Terrain
@@ -78,6 +80,7 @@ class VoxelMap(eqx.Module):
     - `voxel_size`: (3,) voxel edges in m, positive; or one number for cubes.
     - `origin`: (3,) lower south-west corner in m.
     - `leaf_angles`: distribution of leaf inclination, a `LeafAngles`, or None: spherical. Default None.
+    - `crs`: coordinate reference system of `origin`, as that of `Terrain`. Default None: not known.
 
     **Raises:** ValueError for extinction that is negative or not finite, sizes that are not positive, leaf
     and bark of different shapes, an edge or origin that is neither one number nor three, and a map with
@@ -98,6 +101,7 @@ class VoxelMap(eqx.Module):
     voxel_size: Float[Array, "3"] = eqx.field(converter=_triple("voxel_size"))
     origin: Float[Array | np.ndarray, "3"] = eqx.field(converter=coordinates("origin", 3))
     leaf_angles: LeafAngles | None = None
+    crs: str | None = eqx.field(static=True, converter=crs_name, default=None)
 
     ranges: ClassVar = {
         "leaf": Range(0.0),
@@ -254,6 +258,7 @@ class VoxelMap(eqx.Module):
             self.voxel_size,
             np.asarray(self.origin, float) + np.asarray(self.voxel_size, float) * first,
             self.leaf_angles,
+            self.crs,
         )
 
     def above(self, terrain: Terrain) -> "VoxelMap":
@@ -269,8 +274,8 @@ class VoxelMap(eqx.Module):
 
         **Returns:** a `VoxelMap` with more layers, as many as the terrain rises by.
 
-        **Raises:** ValueError for a map that lies partly off the terrain, and within a JAX transformation;
-        TypeError where `terrain` is not a `Terrain`.
+        **Raises:** ValueError for a map that lies partly off the terrain, or has another `crs`, and within a
+        JAX transformation; TypeError where `terrain` is not a `Terrain`.
 
         **Example:**
 
@@ -281,6 +286,7 @@ class VoxelMap(eqx.Module):
         (2, 2, 5) [0.0, 0.0, 10.0] [[0.25, 0.5, 0.5, 0.25, 0.0], [0.0, 0.25, 0.5, 0.5, 0.25]]
         """
         check_kind("terrain", terrain, Terrain, "a Terrain")
+        crs = common_crs({"voxels": self.crs, "terrain": terrain.crs})
         size, origin, heights = (concrete(a) for a in (self.voxel_size, self.origin, terrain.heights))
         if size is None or origin is None or heights is None:
             raise ValueError("a JAX transformation is tracing the map or the terrain: lift the map outside")
@@ -306,7 +312,8 @@ class VoxelMap(eqx.Module):
             return (1.0 - fraction) * upper + fraction * lower
 
         corner = origin + np.array([0.0, 0.0, base * size[2]])
-        return VoxelMap(lifted(self.leaf), lifted(self.bark), self.voxel_size, corner, self.leaf_angles)
+        leaf, bark, angles = lifted(self.leaf), lifted(self.bark), self.leaf_angles
+        return VoxelMap(leaf, bark, self.voxel_size, corner, angles, crs)
 
     def mean_extinction(self) -> Float[np.ndarray, "nx ny nz"]:
         """Sum the extinction coefficients of leaf (at G = 1/2) and bark.

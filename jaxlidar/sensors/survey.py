@@ -31,10 +31,11 @@ from jaxlidar._fields.checks import (
     check_range,
     concrete_array,
     concrete_number,
+    crs_name,
     warn_unit,
 )
 from jaxlidar._jax.memory import format_bytes, machine_memory
-from jaxlidar._registry import shots_within
+from jaxlidar._registry import common_crs, shots_within
 from jaxlidar._text import number_text
 from jaxlidar.sensors.lidar import AIM_DISTANCE, STRAIGHT_UP, Lidar
 from jaxlidar.sensors.scan import MAX_ZENITH, AbstractScan
@@ -78,6 +79,8 @@ class Survey(eqx.Module):
       None: not known.
     - `flight_line`: number of the flight line, an integer in [0, 65535], one number or (shots,). Default
       None: not known.
+    - `crs`: coordinate reference system of the positions, in metres, such as "EPSG:32633", or its EPSG
+      number. `Survey.fly` takes that of the trajectory. Default None: not known.
 
     **Raises:** ValueError for arrays of other shapes, no shot at all, values outside their ranges, and a
     sensor together with a position or an altitude; TypeError for objects of the wrong type.
@@ -102,6 +105,7 @@ class Survey(eqx.Module):
     gps_time: Float[np.ndarray, " shots"] | None
     scan_angle: Float[np.ndarray, " shots"] | None
     flight_line: Int[np.ndarray, " shots"] | None
+    crs: str | None = eqx.field(static=True)
 
     def __init__(
         self,
@@ -115,7 +119,9 @@ class Survey(eqx.Module):
         gps_time: Numbers | None = None,
         scan_angle: Numbers | None = None,
         flight_line: Numbers | None = None,
+        crs: str | int | None = None,
     ):
+        self.crs = crs_name(crs)
         check_kind("lidar", lidar, Lidar, "a Lidar, as in Survey(Lidar(), position=...)")
         position = _place(lidar, position, altitude, sensor)
         shots = len(position)
@@ -173,9 +179,10 @@ class Survey(eqx.Module):
         def rows(a: np.ndarray | None) -> np.ndarray | None:
             return None if a is None else a[shots]
 
-        fields = ("zenith", "azimuth", "altitude", "gps_time", "scan_angle", "flight_line")
+        names = ("zenith", "azimuth", "altitude", "gps_time", "scan_angle", "flight_line")
         place = {"sensor" if self.has_sensor_position else "position": self.position[shots]}
-        return Survey(self.lidar, **place, **{name: rows(getattr(self, name)) for name in fields})
+        fields = {name: rows(getattr(self, name)) for name in names}
+        return Survey(self.lidar, **place, **fields, crs=self.crs)
 
     def within(self, scene: Any, margin: SupportsFloat = 0.0) -> "Survey":
         """Return the survey of the shots that meet a scene, such as those of a strip over a plot.
@@ -225,7 +232,9 @@ class Survey(eqx.Module):
     @staticmethod
     def of(lidar: Lidar) -> "Survey":
         """Make the survey of one shot: that of a lidar in its own place and direction."""
-        place = {"sensor" if lidar.has_sensor_position else "position": concrete_array(lidar.position)[None]}
+        place: dict[str, Any] = {
+            "sensor" if lidar.has_sensor_position else "position": concrete_array(lidar.position)[None]
+        }
         zenith, azimuth = concrete_number(lidar.zenith), concrete_number(lidar.azimuth)
         return Survey(lidar, **place, zenith=zenith, azimuth=azimuth)
 
@@ -240,7 +249,8 @@ class Survey(eqx.Module):
         are for all of the surveys, and `flight_line` is theirs; where one has none, it numbers the surveys
         from 1.
 
-        **Raises:** ValueError for no survey, and for lidars that differ; TypeError for other objects.
+        **Raises:** ValueError for no survey, and for lidars or a `crs` that differ; TypeError for other
+        objects.
 
         **Example:**
 
@@ -264,12 +274,13 @@ class Survey(eqx.Module):
             arrays = [getattr(survey, name) for survey in surveys]
             return None if any(a is None for a in arrays) else np.concatenate(arrays)
 
-        fields = ("zenith", "azimuth", "altitude", "gps_time", "scan_angle")
+        fields = {name: rows(name) for name in ("zenith", "azimuth", "altitude", "gps_time", "scan_angle")}
+        crs = common_crs({f"surveys[{i}]": survey.crs for i, survey in enumerate(surveys)})
         place = {"sensor" if first.has_sensor_position else "position": rows("position")}
         flight_line = rows("flight_line")
         if flight_line is None:
             flight_line = np.repeat(np.arange(1, len(surveys) + 1), [len(survey) for survey in surveys])
-        return Survey(first.lidar, **place, **{name: rows(name) for name in fields}, flight_line=flight_line)
+        return Survey(first.lidar, **place, **fields, flight_line=flight_line, crs=crs)
 
     @property
     def has_sensor_position(self) -> bool:
@@ -565,6 +576,7 @@ def _lifted(flight: Trajectory, terrain: Any) -> Trajectory:
     """Return a trajectory whose heights are above a terrain as one whose heights are above z = 0."""
     if not callable(getattr(terrain, "height_at", None)):
         raise TypeError(f"above is a {type(terrain).__name__}; admissible is a Terrain, or None")
+    common_crs({"trajectory": flight.crs, "above": terrain.crs})
     ground = np.asarray(terrain.height_at(flight.position[:, 0], flight.position[:, 1]), float)
     return eqx.tree_at(
         lambda f: f.position, flight, flight.position + np.pad(ground[:, None], ((0, 0), (2, 0)))
@@ -599,7 +611,8 @@ def _strip(
     # Positive to the right of the platform's heading.
     yaw = np.deg2rad(flight.yaw)
     scan_angle = np.rad2deg(np.arctan2(east * np.cos(yaw) - north * np.sin(yaw), -up))
-    order = {"gps_time": flight.time, "scan_angle": scan_angle, "flight_line": flight_line}
+    order: dict[str, Any] = {"gps_time": flight.time, "scan_angle": scan_angle, "flight_line": flight_line}
+    order["crs"] = flight.crs
     if lidar.has_sensor_position:
         return Survey(lidar, sensor=sensor, zenith=zenith, azimuth=azimuth, **order)
     # A pattern at the limit may exceed it by rounding.

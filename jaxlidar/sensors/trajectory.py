@@ -25,7 +25,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
-from jaxlidar._fields.checks import Numbers, UnitWarning, as_numpy, check_range, warn_user
+from jaxlidar._fields.checks import Numbers, UnitWarning, as_numpy, check_range, crs_name, warn_user
 from jaxlidar._text import number_text
 
 # Courses of two positions that are nearer to one another than this, m, are not defined.
@@ -49,6 +49,8 @@ class Trajectory(eqx.Module):
     - `pitch`: degrees in [-90, 90], positive where the nose is up; one number or (n,). Default 0.
     - `yaw`: heading in degrees clockwise from north (+y); one number or (n,). Default None: the course, in
       which the positions advance; north for a platform that does not move.
+    - `crs`: coordinate reference system of `position`, in metres, such as "EPSG:32633", or its EPSG number.
+      Default None: not known.
 
     **Raises:** ValueError for arrays of other shapes, values that are not finite or outside their ranges, and
     times that do not increase strictly; TypeError for what is not numbers.
@@ -69,6 +71,7 @@ class Trajectory(eqx.Module):
     roll: Float[np.ndarray, " n"]
     pitch: Float[np.ndarray, " n"]
     yaw: Float[np.ndarray, " n"]
+    crs: str | None = eqx.field(static=True)
 
     def __init__(
         self,
@@ -77,7 +80,9 @@ class Trajectory(eqx.Module):
         roll: Numbers = 0.0,
         pitch: Numbers = 0.0,
         yaw: Numbers | None = None,
+        crs: str | int | None = None,
     ):
+        self.crs = crs_name(crs)
         check_range("time", time)
         times = np.atleast_1d(as_numpy(time, "time"))
         if times.ndim != 1 or times.size == 0:

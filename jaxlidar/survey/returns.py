@@ -61,6 +61,7 @@ from jaxlidar._fields.checks import (
     warn_user,
 )
 from jaxlidar._not_kept import NotKept
+from jaxlidar._registry import common_crs
 from jaxlidar.io.airborne import AirborneShot, Returns, Segment
 from jaxlidar.io.las import LasWriter, write_las
 from jaxlidar.planning.channels import unnumbered
@@ -129,6 +130,7 @@ class DiscreteReturns(eqx.Module):
     - `ground_height`: (returns,) m, of the ground below, where the beam's axis meets it; NaN where there is
       none.
     - `gps_time`: (returns,) s, NaN if unknown; `scan_angle`: (returns,) degrees; `flight_line`: (returns,).
+    - `crs`: coordinate reference system of the survey and its scene; None if unknown.
 
     Material and ground share are from the simulation; instruments do not record them.
 
@@ -161,6 +163,7 @@ class DiscreteReturns(eqx.Module):
     scan_angle: Float[np.ndarray, " returns"]
     flight_line: Int[np.ndarray, " returns"]
     n_shots: int = eqx.field(static=True)
+    crs: str | None = eqx.field(static=True, default=None)
 
     def __len__(self) -> int:
         return len(self.shot)
@@ -208,11 +211,11 @@ class DiscreteReturns(eqx.Module):
         - `path`: the file, which ends in ".las" or ".laz". Missing folders are created. Or a
           `jaxlidar.io.LasWriter`, to which the returns are added, if there are any: there an intensity of
           65535 is a reflectance of one, and larger ones are refused.
-        - `crs`: coordinate reference system of the scene, in metres, such as "EPSG:32633". Default None: not
-          known, or that of the `LasWriter`. This needs pyproj.
+        - `crs`: coordinate reference system of the scene, in metres, such as "EPSG:32633". Default None: that
+          of the returns, or of the `LasWriter`. This needs pyproj.
 
-        **Raises:** as `jaxlidar.io.write_las`; ValueError where there is no return, and for more than 15 of
-        one shot (`max_returns` of `Waveforms.returns`).
+        **Raises:** as `jaxlidar.io.write_las`; ValueError for another system than that of the returns, where
+        there is no return, and for more than 15 of one shot (`max_returns` of `Waveforms.returns`).
 
         **Example:**
 
@@ -231,7 +234,7 @@ class DiscreteReturns(eqx.Module):
                 raise ValueError(f"crs = {crs!r} is given together with a LasWriter, which has its own")
             if len(self):
                 intensity = _FULL_INTENSITY * np.maximum(self.reflectance, 0.0)
-                path.write(self.position, **self._point_fields(intensity))
+                path.write(self.position, **self._point_fields(intensity), crs=self.crs)
             return
         if len(self) == 0:
             raise ValueError(
@@ -239,6 +242,7 @@ class DiscreteReturns(eqx.Module):
                 "the threshold; give a lower threshold to returns or to_las (min_reflectance to "
                 "true_returns), or write the waveforms with to_las_waveforms"
             )
+        crs = common_crs({"the simulation": self.crs, "crs": crs})
         write_las(path, self.position, crs=crs, **self._point_fields(self.intensity))
 
     def _point_fields(self, intensity: Num[np.ndarray, " returns"]) -> dict[str, Any]:
@@ -310,7 +314,7 @@ class DetectorInput:
     - `surface_height`: of the truth, by surface, (shots,) m; empty without truth.
     - `axes`: of the beams. - `acquisition`: of the shots. - `constant`: radiometric constant, J m2.
     - `receiver_noise`: `Acquisition.noise`, J.
-    - `ground_height`: (shots,) m.
+    - `ground_height`: (shots,) m. - `crs`: coordinate reference system, or None.
     """
 
     time: Float[np.ndarray, " samples"]
@@ -325,6 +329,7 @@ class DetectorInput:
     constant: float
     receiver_noise: float
     ground_height: Float[np.ndarray, " shots"]
+    crs: str | None = None
 
     def __len__(self) -> int:
         return len(self.recorded)
@@ -378,6 +383,7 @@ def input_of_waveforms(waves: Any, wavelength: Any) -> DetectorInput:
         constant=float(waves.acquisition.radiometric_constant[w]),
         receiver_noise=float(waves.acquisition.noise[w]),
         ground_height=np.asarray(waves.ground_height, float),
+        crs=waves.crs,
     )
 
 
@@ -1053,6 +1059,7 @@ def _assemble(
         scan_angle=acquisition.scan_angle[shot],
         flight_line=acquisition.flight_line[shot],
         n_shots=len(waves),
+        crs=waves.crs,
     )
 
 

@@ -32,7 +32,7 @@ from jaxlidar._fields.checks import (
 )
 from jaxlidar._fingerprint import fingerprint
 from jaxlidar._jax.workers import WorkUnit, outcomes
-from jaxlidar._registry import simulate_survey
+from jaxlidar._registry import common_crs, simulate_survey
 from jaxlidar.io.case import Case, case_text
 from jaxlidar.io.store import check_store_path, open_store
 from jaxlidar.progress import Progress, ProgressOption, shows_progress
@@ -141,10 +141,10 @@ def simulate_many(
 
     **Raises:** TypeError for arguments of another class, and inside a JAX transformation. ValueError, before
     any work, for inadmissible arguments, a scene that reaches up to the sensor, shots off the scene (see
-    `beyond`), a receiver whose window opens at the first return, shots that must share light and cannot, and
-    a `path` that is no Zarr store, or has results of another problem, naming what differs. OSError for a
-    `path` that another run uses, or that cannot be written. RuntimeError where the workers of a task die
-    twice.
+    `beyond`), a survey and a scene whose `crs` differ, a receiver whose window opens at the first return,
+    shots that must share light and cannot, and a `path` that is no Zarr store, or has results of another
+    problem, naming what differs. OSError for a `path` that another run uses, or that cannot be written.
+    RuntimeError where the workers of a task die twice.
 
     **Example:**
 
@@ -207,7 +207,8 @@ def simulate_many(
     }
     run_tasks = functools.partial(outcomes, executor=executor, devices=devices)
     is_narrow = isinstance(scene, Scene) and beams_are_narrow(survey, scene.canopy)
-    info: dict[str, Any] = {"automatic orders": max_orders is None, "narrow beams": is_narrow}
+    crs = common_crs({"survey": survey.crs, "scene": scene.crs if isinstance(scene, Scene) else None})
+    info: dict[str, Any] = {"automatic orders": max_orders is None, "narrow beams": is_narrow, "crs": crs}
     if path is None:
         results = SurveyResults.in_memory(strategy)
         _trace(results, key, run_tasks, progress)

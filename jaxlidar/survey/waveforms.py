@@ -12,7 +12,7 @@ from jaxtyping import ArrayLike, Float, Int
 from jaxlidar._constants import SPEED_OF_LIGHT
 from jaxlidar._fields.checks import check_index, check_numbers
 from jaxlidar._not_kept import NotKept
-from jaxlidar._registry import detect_returns, true_returns
+from jaxlidar._registry import common_crs, detect_returns, true_returns
 from jaxlidar._text import NOTABLE_FRACTION, percent
 from jaxlidar.io import netcdf
 from jaxlidar.io.case import Case
@@ -70,10 +70,11 @@ class Waveforms(eqx.Module):
     - `acquisition`: an `Acquisition`, what else discrete returns need; None for files of earlier versions.
     - `info`: dict of "rtol", "orders" followed, "automatic orders" (False where `max_orders` was given),
       "narrow beams" (True where all are narrower than a voxel), "altitude" of the lidar in m (None for
-      sensors), "seconds" that it took, and whether light was "shared" (over `SceneParts`: in all tiles). Over
-      one scene with shared light, also the spacing in m of the "grid" of nodes at which it entered, and a
-      bound on the fraction of samples that "parallel light" changes. Over `SceneParts`, also the number of
-      "parts", the "margin" in m around tiles, and the "margin of all light", which loses none.
+      sensors), "crs" of the survey and its scene (None if unknown), "seconds" that it took, and whether light
+      was "shared" (over `SceneParts`: in all tiles). Over one scene with shared light, also the spacing in m
+      of the "grid" of nodes at which it entered, and a bound on the fraction of samples that "parallel light"
+      changes. Over `SceneParts`, also the number of "parts", the "margin" in m around tiles, and the "margin
+      of all light", which loses none.
 
     **Example:**
 
@@ -126,6 +127,11 @@ class Waveforms(eqx.Module):
     def direction(self) -> Float[np.ndarray, "shots 3"]:
         """Unit vectors (shots, 3) in which the beams travel, as `Survey.direction`."""
         return beam_directions(self.zenith, self.azimuth)
+
+    @property
+    def crs(self) -> str | None:
+        """Coordinate reference system of the survey and its scene, such as "EPSG:32633"; None if unknown."""
+        return self.info.get("crs")
 
     @property
     def ground_position(self) -> Float[np.ndarray, "shots 3"]:
@@ -400,6 +406,7 @@ class Waveforms(eqx.Module):
         2 shots, 2.5 m
         """
         wavelength, record = options.get("wavelength"), options.get("record")
+        crs = common_crs({"the simulation": self.crs, "crs": crs})
         returns = self.returns(detector, **{"max_returns": MAX_LAS_RETURNS, **options})
         waves = input_of_waveforms(self, wavelength)
         records = waves.recorded if record is None else _at_wavelength(record, self.wavelength, wavelength)
