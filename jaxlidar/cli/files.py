@@ -1,5 +1,6 @@
 """The commands `jaxlidar info` and `jaxlidar convert`."""
 
+import contextlib
 import re
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -15,6 +16,7 @@ from jaxlidar.io import (
     atomic_write,
     read_case,
     read_gedi_l1b,
+    read_inventory,
     read_las_waveforms,
     read_mesh,
     read_neon,
@@ -33,6 +35,7 @@ from jaxlidar.io.las_waveforms import has_packets
 from jaxlidar.io.netcdf import open as open_result
 from jaxlidar.optics.prospect import Prospect
 from jaxlidar.optics.spectra import read_spectrum_csv
+from jaxlidar.plants.inventory import columns_in_use
 from jaxlidar.scenes.canopy import Canopy
 from jaxlidar.scenes.scene import Scene
 from jaxlidar.scenes.voxels import VoxelMap
@@ -45,8 +48,10 @@ FILE_PATH = ResultPath(exists=True)
 MAX_DESCRIBED_SHOTS = 1000
 # A column that tables of cylinders have, in the first line of a file, and the longest such line in bytes.
 TREE_COLUMN, MAX_HEAD = re.compile(r"start_?x", re.IGNORECASE), 10_000
-# Columns that tables of positions and attitudes have, and those whose numbers are relative to true north.
+# Columns that tables of positions and attitudes have, those of time, which inventories of trees lack, and
+# those whose numbers are relative to true north.
 TRAJECTORY_COLUMN = re.compile(r"(?<![a-z])(roll|pitch|yaw|heading|easting)(?![a-z])", re.IGNORECASE)
+TIME_COLUMN = re.compile(r"time|(?<![a-z])sow(?![a-z])", re.IGNORECASE)
 GEOGRAPHIC_COLUMN = re.compile(r"(?<![a-z])(lon|lng|long|longitude|true)(?![a-z])", re.IGNORECASE)
 
 
@@ -177,12 +182,37 @@ def describe_spectrum(path: Path) -> str:
     return f"spectrum {spectrum.name!r} of {spectrum.wavelength.size} samples from {low:g} to {high:g} nm"
 
 
+def describe_inventory(path: Path, columns: dict[str, str], others: list[str]) -> str:
+    """Describe an inventory, with the names of its columns by quantity, and those that are not read."""
+    trees = read_inventory(path)
+    places = np.stack([trees.x, trees.y])
+    lines = [f"inventory of {len(trees.x):,} trees: {_spans(places.min(axis=1), places.max(axis=1))}"]
+    for quantity in columns.keys() - {"x", "y", "species"}:
+        values = np.asarray(getattr(trees, quantity))
+        known, unit = values[np.isfinite(values)], "m2" if quantity == "leaf_area" else "m"
+        span = f"{known.min():.4g} to {known.max():.4g} {unit}" if known.size else "not measured"
+        missing = f", {values.size - known.size} without" if 0 < known.size < values.size else ""
+        lines.append(f"{quantity.replace('_', ' ')}: {span}{missing}")
+    if trees.species is not None:
+        names, counts = np.unique(trees.species, return_counts=True)
+        lines.append("species: " + ", ".join(f"{count:,} {name}" for name, count in zip(names, counts)))
+    read = [name if name == quantity else f"{name} as {quantity}" for quantity, name in columns.items()]
+    not_read = f"; not read: {', '.join(others)}" if others else ""
+    return "\n".join([lines[0], *sorted(lines[1:]), f"columns: {', '.join(read)}{not_read}"])
+
+
 def describe_csv(path: Path) -> str:
-    """Describe a table of cylinders, or a trajectory, by the names of its columns, otherwise a spectrum."""
+    """Describe a table of cylinders, trees or a trajectory by the names of its columns, else a spectrum."""
     with path.open("rb") as file:
         head = file.readline(MAX_HEAD).decode("utf-8", "replace")
     if TREE_COLUMN.search(head):
         return describe_tree(path)
+    names = [name.strip() for name in re.split(r"[,;\t]", head)]
+    columns: dict[str, str] = {}
+    with contextlib.suppress(ValueError):
+        columns, _ = columns_in_use(names)
+    if columns and not TIME_COLUMN.search(head):
+        return describe_inventory(path, columns, [name for name in names if name not in columns.values()])
     if not TRAJECTORY_COLUMN.search(head):
         return describe_spectrum(path)
     if GEOGRAPHIC_COLUMN.search(head):
@@ -228,7 +258,8 @@ def info(file: Path) -> None:
 
     Known are cases (.toml), results (.nc, .zarr), voxels (.vox), points (.las, .laz), airborne waveforms
     (.las with .wdp, .pls with .wvs, NEON's .npz), GEDI level 1B (.h5), tree models (.qsm, .txt, .csv), meshes
-    (.obj, .ply, .stl, .gltf, .glb), elevation models (.tif, .tiff, .asc), trajectories and spectra (.csv).
+    (.obj, .ply, .stl, .gltf, .glb), elevation models (.tif, .tiff, .asc), inventories of trees, trajectories
+    and spectra (.csv).
 
     \b
     Examples:

@@ -29,7 +29,8 @@ def scene(
     """Draw a scene from the side: optical depth of leaf and bark, plates, meshes, ground and the beam.
 
     Leaf and bark are shaded by 1 - exp(-optical depth) of a horizontal view through all of the voxel map.
-    Planes and terrain are cut at the middle of the map, or of the footprint if there is no map.
+    Planes and terrain are cut at the middle of the map, of the meshes if there is no map, or of the
+    footprint. The figure takes in the map, all meshes and the footprint.
 
     **Arguments:**
 
@@ -58,34 +59,37 @@ def scene(
         raise ValueError(f"along = {along!r} is none of 'x', 'y'")
     ax = make_axes(ax, (3.5, 4.2))
     across, depth = (0, 1) if along == "y" else (1, 0)
-    radius = 0.0 if lidar is None else float(lidar.footprint_radius)
     centre = np.zeros(2) if lidar is None else np.asarray(lidar.position, dtype=float)[:2]
-    low, high, top = centre[across] - 1.3 * radius, centre[across] + 1.3 * radius, 0.0
-    middle = centre[depth]
-    entries: list[Any] = []
+    # Boxes of what the figure shows, horizontally: lowest and highest corners.
+    boxes, heights, entries = [], [], []
+    if lidar is not None:
+        reach = 1.3 * float(lidar.footprint_radius)
+        boxes.append((centre - reach, centre + reach))
+        heights += [float(lidar.sensor[2])] if lidar.altitude is None else []
+    if scene.meshes:
+        bounds = np.concatenate([mesh.bounds() for mesh in scene.meshes])
+        boxes.append((bounds[:, 0, :2].min(axis=0), bounds[:, 1, :2].max(axis=0)))
     if scene.canopy is not None:
         voxels = scene.canopy.voxels
-        origin, end = np.asarray(voxels.origin, dtype=float), np.asarray(voxels.top, dtype=float)
-        low, high, top = min(low, origin[across]), max(high, end[across]), end[2]
-        middle = 0.5 * (origin[depth] + end[depth])
+        origin, size = np.asarray(voxels.origin, dtype=float), np.asarray(voxels.voxel_size, dtype=float)
+        # In double precision, as map coordinates need.
+        end = origin + size * voxels.shape
+        boxes.append((origin[:2], end[:2]))
+        heights.append(end[2])
         extent = (origin[across], end[across], origin[2], end[2])
-        edge = float(voxels.voxel_size[depth])
-        entries += _draw_voxels(ax, voxels.leaf, "leaf", depth, edge, extent)
-        entries += _draw_voxels(ax, voxels.bark, "bark", depth, edge, extent)
+        entries += _draw_voxels(ax, voxels.leaf, "leaf", depth, size[depth], extent)
+        entries += _draw_voxels(ax, voxels.bark, "bark", depth, size[depth], extent)
+    low, high = _extent(boxes, across)
     if isinstance(scene.ground, Terrain) and high <= low:
-        # Without a canopy and a beam, the figure has the extent of the terrain.
-        ends = np.stack([np.asarray(scene.ground.origin, dtype=float), scene.ground.end])
-        (low, high), middle = ends[:, across], ends[:, depth].mean()
-    if scene.meshes and high <= low:
-        boxes = np.concatenate([mesh.bounds() for mesh in scene.meshes])
-        low, high = boxes[:, 0, across].min(), boxes[:, 1, across].max()
+        # Without a canopy, meshes and a beam, the figure has the extent of the terrain.
+        boxes = [(np.asarray(scene.ground.origin, dtype=float), scene.ground.end)]
+        low, high = _extent(boxes, across)
     if high <= low:
-        low, high = centre[across] - 1.0, centre[across] + 1.0
+        low, high = low - 1.0, low + 1.0
+    # The map goes before meshes, and these before the footprint.
+    middle = 0.5 * (boxes[-1][0][depth] + boxes[-1][1][depth]) if boxes else centre[depth]
     sides = np.array([low, high])
     profile = _ground_profile(scene.ground, sides, across, middle)
-    heights = [top] if scene.canopy is not None or not isinstance(scene.ground, Terrain) else []
-    if lidar is not None and lidar.altitude is None:
-        heights.append(float(lidar.sensor[2]))
     for mesh in scene.meshes:
         outlines = mesh.corners()[:, :, [across, 2]]
         heights += [outlines[..., 1].min(), outlines[..., 1].max()]
@@ -96,7 +100,7 @@ def scene(
         heights += z.tolist()
         if isinstance(surface, AbstractSheet):
             entries += ax.plot(sides, z, color=MATERIAL_COLOURS["plate"], linewidth=2.5, label="plate")
-    bottom, top = min(heights), max(heights)
+    bottom, top = min(heights, default=0.0), max(heights, default=0.0)
     margin = max(0.06 * (top - bottom), 0.2)
     if scene.ground is not None:
         # The ground is filled far below the lower limit, in case that a caller widens the limits.
@@ -116,6 +120,14 @@ def scene(
         style = {"frameon": False, "fontsize": "small", "ncols": 2, "handlelength": 1.5, "columnspacing": 1.2}
         ax.legend(by_name.values(), by_name.keys(), loc="lower center", bbox_to_anchor=(0.5, 1.0), **style)
     return ax
+
+
+def _extent(boxes: list[tuple[np.ndarray, np.ndarray]], across: int) -> tuple[float, float]:
+    """Return the lowest and the highest position of boxes along an axis; zeros without any."""
+    return (
+        min((float(low[across]) for low, _ in boxes), default=0.0),
+        max((float(high[across]) for _, high in boxes), default=0.0),
+    )
 
 
 def _draw_voxels(

@@ -45,6 +45,19 @@ def no_compilation_cache(monkeypatch):
             "trajectory by longitude and latitude, or with a true heading: ",
         ),
         (
+            "trees.csv",
+            "tree,species,x,y,height,dbh_cm\n1,beech,2.5,7,21.4,35\n2,oak,8,3,18,\n3,oak,9,3,16,20\n",
+            "inventory of 3 trees: x 2.50 to 9.00 m, y 3.00 to 7.00 m\n"
+            "diameter: 0.2 to 0.35 m, 1 without\nheight: 16 to 21.4 m\nspecies: 1 beech, 2 oak\n"
+            "columns: species, x, y, height, dbh_cm as diameter; not read: tree\n",
+        ),
+        (
+            "plot.csv",
+            "Easting;Northing;Ht [m]\n400000;5300000;12\n",
+            "inventory of 1 trees: x 400000.00 to 400000.00 m, y 5300000.00 to 5300000.00 m\n"
+            "height: 12 to 12 m\ncolumns: Easting as x, Northing as y, Ht [m] as height\n",
+        ),
+        (
             "leaf.csv",
             "wavelength,controlled reflectance\n400,0.1\n500,0.2\n",
             "spectrum 'leaf' of 2 samples from 400 to 500 nm",

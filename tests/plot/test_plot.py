@@ -1,5 +1,6 @@
 """Figures: data and units that are drawn, on the given axes or new ones."""
 
+import equinox as eqx
 import jax
 import matplotlib
 import numpy as np
@@ -148,6 +149,32 @@ def test_terrain_is_drawn_at_the_middle_of_the_map(axes):
     axes.clear()
     plot.scene(jl.Scene(ground=terrain), ax=axes, along="x")
     assert axes.get_xlim() == (-1.5, 1.5)
+
+
+@pytest.mark.parametrize("along", ["x", "y"])
+def test_scenes_in_map_coordinates_are_drawn_where_they_stand(axes, along):
+    """Planted: limits that take in the origin of the map, and meshes that end at the voxels."""
+    corner = np.array([4e5, 5.3e6, 700.0])
+    canopy = canopy_scene().canopy
+    voxels = eqx.tree_at(lambda v: v.origin, canopy.voxels, corner)
+    canopy = eqx.tree_at(lambda c: c.voxels, canopy, voxels)
+    corners = corner + np.array([[5, 6, 3], [9, 6, 3], [9, 11, 3]])
+    roof = jl.MeshSurface((corners, [[0, 1, 2]]), reflectance=0.4)
+    terrain = jl.Terrain(np.full((9, 9), 699.0), 5.0, corner[:2] - 10.0)
+    end = corner + np.asarray(voxels.voxel_size) * voxels.shape
+    k = 0 if along == "y" else 1
+    plot.scene(jl.Scene(canopy=canopy, ground=terrain), ax=axes, along=along)
+    np.testing.assert_allclose(axes.get_xlim(), [corner[k], end[k]], rtol=0, atol=1e-6)
+    assert axes.get_ylim()[0] > 698.0
+    plot.scene(jl.Scene(canopy=canopy, meshes=[roof], ground=terrain), ax=axes, along=along)
+    np.testing.assert_allclose(axes.get_xlim(), [corner[k], corner[k] + (9, 11)[k]], rtol=0, atol=1e-6)
+    axes.clear()
+    plot.scene(jl.Scene(meshes=[roof]), ax=axes, along=along)
+    np.testing.assert_allclose(axes.get_xlim(), corner[k] + np.array([(5, 9), (6, 11)][k]), rtol=0, atol=1e-6)
+    assert 702.0 < axes.get_ylim()[0] < axes.get_ylim()[1] < 704.0
+    axes.clear()
+    plot.scene(jl.Scene(ground=jl.Ground(500.0)), ax=axes, along=along)
+    assert axes.get_ylim()[0] > 499.0
 
 
 def test_an_empty_scene_and_new_figures():
