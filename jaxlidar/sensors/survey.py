@@ -18,17 +18,20 @@ from collections.abc import Sequence
 from typing import Any, SupportsFloat, final
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, PRNGKeyArray
 
 from jaxlidar._fields.checks import (
     Numbers,
     as_numpy,
     check_integer,
+    check_key,
     check_kind,
     check_number,
     check_range,
+    check_shape,
     concrete_array,
     concrete_number,
     crs_name,
@@ -39,7 +42,7 @@ from jaxlidar._registry import common_crs, shots_within
 from jaxlidar._text import number_text
 from jaxlidar.sensors.lidar import AIM_DISTANCE, STRAIGHT_UP, Lidar
 from jaxlidar.sensors.scan import MAX_ZENITH, AbstractScan
-from jaxlidar.sensors.trajectory import Trajectory, rotation_matrix, three_numbers
+from jaxlidar.sensors.trajectory import Trajectory, body_rotation, rotation_matrix, three_numbers
 
 # A length that falls short of a multiple of the spacing by this fraction, as by rounding, counts as the
 # multiple.
@@ -48,6 +51,8 @@ _SPACING_TOLERANCE = 1e-6
 MAX_FLIGHT_LINE = 2**16 - 1
 # Bytes of a shot while a survey is made: its position and direction, and the terms of their sums.
 _BYTES_PER_SHOT = 100.0
+# Fields that are known of all shots, or of none.
+_OPTIONAL_ROWS = ("gps_time", "scan_angle", "attitude")
 # More positions along a line than fit into any memory.
 _LARGEST_COUNT = 1e30
 
@@ -81,6 +86,11 @@ class Survey(eqx.Module):
       None: not known.
     - `crs`: coordinate reference system of the positions, in metres, such as "EPSG:32633", or its EPSG
       number. `Survey.fly` takes that of the trajectory. Default None: not known.
+    - `attitude`: (shots, 3) roll, pitch and yaw of the platform in degrees, as those of `Trajectory`, which
+      `Survey.fly` and `Survey.scan` give. Default None: not known.
+    - `stated`: (shots, 6) what is stated of shots by sensors where their geometry is another one: x, y and z
+      of the sensor in m, zenith and azimuth in degrees, and the error of the range in m.
+      `Survey.disturbed` makes it. Default None: the geometry itself.
 
     **Raises:** ValueError for arrays of other shapes, no shot at all, values outside their ranges, and a
     sensor together with a position or an altitude; TypeError for objects of the wrong type.
@@ -106,6 +116,8 @@ class Survey(eqx.Module):
     scan_angle: Float[np.ndarray, " shots"] | None
     flight_line: Int[np.ndarray, " shots"] | None
     crs: str | None = eqx.field(static=True)
+    attitude: Float[np.ndarray, "shots 3"] | None
+    stated: Float[np.ndarray, "shots 6"] | None
 
     def __init__(
         self,
@@ -120,6 +132,8 @@ class Survey(eqx.Module):
         scan_angle: Numbers | None = None,
         flight_line: Numbers | None = None,
         crs: str | int | None = None,
+        attitude: Numbers | None = None,
+        stated: Numbers | None = None,
     ):
         self.crs = crs_name(crs)
         check_kind("lidar", lidar, Lidar, "a Lidar, as in Survey(Lidar(), position=...)")
@@ -152,6 +166,10 @@ class Survey(eqx.Module):
             if np.any(lines != np.floor(lines)):
                 raise ValueError("flight_line has values that are not whole numbers")
         self.flight_line = None if lines is None else lines.astype(int)
+        self.attitude = _optional_rows("attitude", attitude, (shots, 3))
+        self.stated = _optional_rows("stated", stated, (shots, 6))
+        if self.stated is not None and not has_sensors:
+            raise ValueError("stated is given with position; admissible is sensor, or stated = None")
 
     def __len__(self) -> int:
         return len(self.position)
@@ -179,7 +197,7 @@ class Survey(eqx.Module):
         def rows(a: np.ndarray | None) -> np.ndarray | None:
             return None if a is None else a[shots]
 
-        names = ("zenith", "azimuth", "altitude", "gps_time", "scan_angle", "flight_line")
+        names = ("zenith", "azimuth", "altitude", *_OPTIONAL_ROWS, "flight_line", "stated")
         place = {"sensor" if self.has_sensor_position else "position": self.position[shots]}
         fields = {name: rows(getattr(self, name)) for name in names}
         return Survey(self.lidar, **place, **fields, crs=self.crs)
@@ -245,9 +263,9 @@ class Survey(eqx.Module):
         **Arguments:** `surveys`: one or more `Survey`s, all placed by their sensors or all by their altitude.
         Their lidars are equal but for place and direction, which are those of the shots.
 
-        **Returns:** a `Survey` of all shots in that order. `gps_time` and `scan_angle` are known where they
-        are for all of the surveys, and `flight_line` is theirs; where one has none, it numbers the surveys
-        from 1.
+        **Returns:** a `Survey` of all shots in that order. `gps_time`, `scan_angle` and `attitude` are known
+        where they are for all of the surveys, and `flight_line` is theirs; where one has none, it numbers the
+        surveys from 1.
 
         **Raises:** ValueError for no survey, and for lidars or a `crs` that differ; TypeError for other
         objects.
@@ -274,7 +292,9 @@ class Survey(eqx.Module):
             arrays = [getattr(survey, name) for survey in surveys]
             return None if any(a is None for a in arrays) else np.concatenate(arrays)
 
-        fields = {name: rows(name) for name in ("zenith", "azimuth", "altitude", "gps_time", "scan_angle")}
+        fields = {name: rows(name) for name in ("zenith", "azimuth", "altitude", *_OPTIONAL_ROWS)}
+        if any(survey.stated is not None for survey in surveys):
+            fields["stated"] = np.concatenate([survey.stated_rows for survey in surveys])
         crs = common_crs({f"surveys[{i}]": survey.crs for i, survey in enumerate(surveys)})
         place = {"sensor" if first.has_sensor_position else "position": rows("position")}
         flight_line = rows("flight_line")
@@ -306,8 +326,108 @@ class Survey(eqx.Module):
     def relative_to(self, origin: Float[np.ndarray, "2"]) -> "Survey":
         """Make the same survey with positions relative to `origin`, (2,) x and y in m."""
         origin = _horizontal_position("origin", origin)
-        origin = np.pad(origin, (0, self.position.shape[1] - 2))
-        return eqx.tree_at(lambda s: s.position, self, self.position - origin)
+        shift = np.pad(origin, (0, self.position.shape[1] - 2))
+        moved = eqx.tree_at(lambda s: s.position, self, self.position - shift)
+        if self.stated is None:
+            return moved
+        return eqx.tree_at(lambda s: s.stated, moved, self.stated - np.pad(origin, (0, 4)))
+
+    def disturbed(
+        self,
+        *,
+        boresight: Numbers = (0.0, 0.0, 0.0),
+        position: Numbers = 0.0,
+        attitude: Numbers = 0.0,
+        range: SupportsFloat = 0.0,
+        key: PRNGKeyArray | None = None,
+    ) -> "Survey":
+        """Make a survey whose beams are not where it states that they are, so that strips disagree.
+
+        Light goes where the true geometry leads, which is that of the survey that is returned. Results have
+        the stated geometry, which is that of this survey: positions of returns, files, and
+        `Waveforms.position`. Errors of position and attitude are drawn for each flight line and stay the same
+        along it; those of ranges, for each shot. With the rotation R(a) of the platform at the attitude a,
+        the error e of that, the boresight error B and the position error d, a stated beam w of the sensor s
+        travels along R(a + e) B R(a)^T w from s + d.
+
+        **Arguments:**
+
+        - `boresight`: (roll, pitch, yaw) in degrees by which the scanner is turned in the body of the
+          platform beyond its stated mounting. Default (0, 0, 0).
+        - `position`: standard deviation in m of the sensor's position, one number, or three: east, north and
+          up; not negative. Default 0.
+        - `attitude`: standard deviation in degrees, one number, or three: roll, pitch and yaw; not negative.
+          Default 0.
+        - `range`: standard deviation of measured ranges in m, not negative. Default 0.
+        - `key`: a JAX random key, with any of these deviations. Default None: none of them.
+
+        **Returns:** a `Survey` that is placed by its sensors, so that time zero is the emission.
+
+        **Raises:** ValueError for values outside their ranges, deviations without a key, and a boresight or
+        an attitude where the survey has no `attitude`; TypeError for objects of the wrong type.
+
+        **Source:** Skaloud and Lichti (2006), ISPRS J. Photogramm. Remote Sens. 61, 47, equation 1.
+
+        **Example:** a roll of 0.1 degrees, right wing down, turns a beam from 60 m to the left.
+
+        >>> import jaxlidar as jl
+        >>> flight = jl.Trajectory([0.0, 1.0], [(0, 0, 60), (0, 5, 60)])
+        >>> drone = jl.Lidar(sensor=(0, 0, 0))
+        >>> strip = jl.Survey.fly(flight, jl.Conical(half_angle=1e-6, frequency=1.0), lidar=drone)
+        >>> true = strip.disturbed(boresight=(0.1, 0.0, 0.0))
+        >>> print(jl.ground_position(true, jl.Scene(ground=jl.Ground()))[0, :2].round(3))
+        [-0.105  0.   ]
+        """
+        turn = three_numbers("boresight", boresight)
+        deviations = {
+            name: _three_deviations(name, x) for name, x in (("position", position), ("attitude", attitude))
+        }
+        check_number("range", range, 0.0)
+        is_random = float(range) > 0 or any(deviation.any() for deviation in deviations.values())
+        if is_random and key is None:
+            raise ValueError("key is None, but errors are to be drawn; admissible is a JAX random key")
+        turns = bool(turn.any() or deviations["attitude"].any())
+        if turns and self.attitude is None:
+            raise ValueError(
+                "boresight or attitude is given, but the survey has no attitude; admissible is one that "
+                "Survey.fly or Survey.scan makes, or the argument attitude of Survey"
+            )
+        shots = len(self)
+        error: dict[str, Any] = dict.fromkeys(deviations, 0.0)
+        range_error = np.zeros(shots)
+        if key is not None:
+            check_key(key)
+            random = np.random.default_rng(np.asarray(jax.random.bits(key, (8,), np.uint32)))
+            lines = np.zeros(shots, int) if self.flight_line is None else self.flight_line
+            line, n_lines = np.unique(lines, return_inverse=True)[1], len(np.unique(lines))
+            error = {name: (d * random.normal(size=(n_lines, 3)))[line] for name, d in deviations.items()}
+            range_error = float(range) * random.normal(size=shots)
+        zenith, azimuth = self.zenith, self.azimuth
+        if turns:
+            assert self.attitude is not None
+            in_body = np.einsum("sji,sj->si", body_rotation(*self.attitude.T), self.direction)
+            true_rotation = body_rotation(*(self.attitude + error["attitude"]).T)
+            direction = np.einsum("sij,jk,sk->si", true_rotation, rotation_matrix(*turn), in_body)
+            zenith, azimuth = _angles_of(direction)
+        stated = self.stated_rows
+        stated[:, 5] += range_error
+        names = (*_OPTIONAL_ROWS, "flight_line")
+        return Survey(
+            self.lidar,
+            sensor=self.sensor + error["position"],
+            zenith=zenith,
+            azimuth=azimuth,
+            **{name: getattr(self, name) for name in names},
+            crs=self.crs,
+            stated=stated,
+        )
+
+    @property
+    def stated_rows(self) -> Float[np.ndarray, "shots 6"]:
+        """The argument `stated`; where it is None, the survey's own geometry."""
+        if self.stated is not None:
+            return self.stated.copy()
+        return np.column_stack([self.sensor, self.zenith, self.azimuth, np.zeros(len(self))])
 
     @property
     def direction(self) -> Float[np.ndarray, "shots 3"]:
@@ -605,14 +725,12 @@ def _strip(
     if lever_arm is not None:
         sensor = sensor + turn @ lever_arm
     east, north, up = direction.T
-    sine = np.hypot(east, north)
-    zenith = np.rad2deg(np.arctan2(sine, -up))
-    azimuth = np.where(sine > 0, np.rad2deg(np.arctan2(east, north)) % 360.0, 0.0)
+    zenith, azimuth = _angles_of(direction)
     # Positive to the right of the platform's heading.
     yaw = np.deg2rad(flight.yaw)
     scan_angle = np.rad2deg(np.arctan2(east * np.cos(yaw) - north * np.sin(yaw), -up))
     order: dict[str, Any] = {"gps_time": flight.time, "scan_angle": scan_angle, "flight_line": flight_line}
-    order["crs"] = flight.crs
+    order |= {"crs": flight.crs, "attitude": np.stack([flight.roll, flight.pitch, flight.yaw], axis=1)}
     if lidar.has_sensor_position:
         return Survey(lidar, sensor=sensor, zenith=zenith, azimuth=azimuth, **order)
     # A pattern at the limit may exceed it by rounding.
@@ -628,6 +746,14 @@ def _strip(
         )
     aim = sensor[:, :2] - sensor[:, 2:] * direction[:, :2] / up[:, None]
     return Survey(lidar, aim, np.minimum(zenith, MAX_ZENITH), azimuth, sensor[:, 2], **order)
+
+
+def _angles_of(direction: Float[np.ndarray, "shots 3"]) -> tuple[np.ndarray, np.ndarray]:
+    """Return the zenith and azimuth in degrees of unit vectors, the inverse of `beam_directions`."""
+    east, north, up = direction.T
+    sine = np.hypot(east, north)
+    azimuth = np.where(sine > 0, np.rad2deg(np.arctan2(east, north)) % 360.0, 0.0)
+    return np.rad2deg(np.arctan2(sine, -up)), azimuth
 
 
 def beam_directions(
@@ -689,6 +815,22 @@ def _per_shot(field: str, x: Any, shots: int) -> Float[np.ndarray, " shots"]:
 def _optional_per_shot(field: str, x: Any, shots: int) -> Float[np.ndarray, " shots"] | None:
     """Convert as `_per_shot`; None stays None."""
     return None if x is None else _per_shot(field, x, shots)
+
+
+def _optional_rows(field: str, x: Any, shape: tuple[int, int]) -> Float[np.ndarray, "shots _"] | None:
+    """Convert numbers of a row for each shot; None stays None."""
+    if x is None:
+        return None
+    check_range(field, x)
+    check_shape(field, x, shape)
+    return as_numpy(x, field)
+
+
+def _three_deviations(field: str, x: Any) -> Float[np.ndarray, "3"]:
+    """Return three standard deviations, of which one number stands for all."""
+    check_range(field, x, 0.0)
+    check_shape(field, x, (), (3,))
+    return np.broadcast_to(as_numpy(x, field), (3,))
 
 
 def _horizontal_position(field: str, x: Any) -> Float[np.ndarray, "2"]:

@@ -151,8 +151,13 @@ class Trajectory(eqx.Module):
     @property
     def rotation(self) -> Float[np.ndarray, "n 3 3"]:
         """Matrices (n, 3, 3) that turn (forward, right, down) of the body into (east, north, up)."""
-        north, east, down = np.moveaxis(rotation_matrix(self.roll, self.pitch, self.yaw), -2, 0)
-        return np.stack([east, north, -down], axis=-2)
+        return body_rotation(self.roll, self.pitch, self.yaw)
+
+
+def body_rotation(roll: Any, pitch: Any, yaw: Any) -> Float[np.ndarray, "*angles 3 3"]:
+    """Return the matrices that turn (forward, right, down) of the body into (east, north, up)."""
+    north, east, down = np.moveaxis(rotation_matrix(roll, pitch, yaw), -2, 0)
+    return np.stack([east, north, -down], axis=-2)
 
 
 def rotation_matrix(roll: Any, pitch: Any, yaw: Any) -> Float[np.ndarray, "*angles 3 3"]:

@@ -27,7 +27,8 @@ class Acquisition(eqx.Module):
     - `scan_angle`: (shots,) degrees to the right of the track; the zenith angle where the survey has none.
     - `flight_line`: (shots,) number of the flight line; 1 where the survey has none.
     - `range_at_time_zero`: (shots,) m from the sensor, from which light arrives at time zero: that of the
-      reference plane along the beam, or zero for shots that are placed by their sensors.
+      reference plane along the beam, or zero for shots that are placed by their sensors, but for the error
+      of a measured range (`Survey.disturbed`).
     - `pulse`: (lags,) fraction of an echo's energy that a sample records, by the sample's time after the
       echo's time zero, in steps of an eighth of the sampling interval. The middle one is at time zero.
     - `radiometric_constant`: (wavelengths,) J m2: the energy of a return is this times its apparent
@@ -73,13 +74,15 @@ keep_as_netcdf(
 
 def acquisition_of(survey: Survey) -> Acquisition:
     """Return the acquisition of all shots of a survey."""
-    shots = len(survey)
+    shots, range_at_time_zero = len(survey), survey.slant_range
+    if survey.has_sensor_position:
+        range_at_time_zero = survey.stated_rows[:, 5]
     unknown_time = np.full(shots, np.nan)
     return Acquisition(
         gps_time=unknown_time if survey.gps_time is None else survey.gps_time,
         scan_angle=survey.zenith if survey.scan_angle is None else survey.scan_angle,
         flight_line=np.ones(shots, int) if survey.flight_line is None else survey.flight_line,
-        range_at_time_zero=np.zeros(shots) if survey.has_sensor_position else survey.slant_range,
+        range_at_time_zero=range_at_time_zero,
         pulse=sampled_pulse(survey.lidar),
         radiometric_constant=radiometric_constant(survey.lidar),
         noise=noise_without_signal(survey.lidar),

@@ -296,9 +296,12 @@ def _shot_axes(
     range_at_time_zero: Float[np.ndarray, " shots"],
 ) -> ShotAxes:
     """Return the axes of shots; `position` is (x, y) on the reference plane, or (x, y, z) of the sensor."""
-    position = np.asarray(position, float)
-    origin = np.pad(position, ((0, 0), (0, 3 - position.shape[1])))
-    return ShotAxes(origin, beam_directions(zenith, azimuth), np.asarray(range_at_time_zero, float))
+    position, direction = np.asarray(position, float), beam_directions(zenith, azimuth)
+    distance = np.asarray(range_at_time_zero, float)
+    if position.shape[1] == 3:
+        # Zero, but for errors of measured ranges.
+        return ShotAxes(position + distance[:, None] * direction, direction, distance)
+    return ShotAxes(np.pad(position, ((0, 0), (0, 1))), direction, distance)
 
 
 # -- waveforms as input ------------------------------------------------------------------------------------
@@ -369,6 +372,8 @@ def input_of_waveforms(waves: Any, wavelength: Any) -> DetectorInput:
         )
     w = wavelength_index(wavelength, np.asarray(waves.wavelength, float))
     zenith, azimuth = np.asarray(waves.zenith, float), np.asarray(waves.azimuth, float)
+    # True heights state no point of stated axes.
+    is_disturbed = waves.info.get("disturbed", False)
     return DetectorInput(
         time=np.asarray(waves.time, float),
         recorded=waves.recorded[:, w],
@@ -377,7 +382,7 @@ def input_of_waveforms(waves: Any, wavelength: Any) -> DetectorInput:
         stderr=waves.stderr if isinstance(waves.stderr, NotKept) else waves.stderr[:, w],
         components={name: a[:, w] for name, a in waves.components.items() if name not in _ORDERS},
         truth=None if waves.truth is None else {name: a[:, w] for name, a in waves.truth.returns.items()},
-        surface_height={} if waves.truth is None else waves.truth.surface_height,
+        surface_height={} if waves.truth is None or is_disturbed else waves.truth.surface_height,
         axes=_shot_axes(waves.position, zenith, azimuth, waves.acquisition.range_at_time_zero),
         acquisition=waves.acquisition,
         constant=float(waves.acquisition.radiometric_constant[w]),

@@ -198,9 +198,7 @@ def simulate_many(
     if may_miss_plants and (message := off_map_message(off_map_fractions)) is not None:
         warn_user(message, OffMapWarning)
     survey_fields: dict[str, Any] = {
-        "position": survey.position,
-        "zenith": survey.zenith,
-        "azimuth": survey.azimuth,
+        **_stated_geometry(survey),
         "ground_height": heights,
         "off_map": off_map_fractions,
         "acquisition": acquisition_of(survey),
@@ -209,6 +207,7 @@ def simulate_many(
     is_narrow = isinstance(scene, Scene) and beams_are_narrow(survey, scene.canopy)
     crs = common_crs({"survey": survey.crs, "scene": scene.crs if isinstance(scene, Scene) else None})
     info: dict[str, Any] = {"automatic orders": max_orders is None, "narrow beams": is_narrow, "crs": crs}
+    info |= {} if survey.stated is None else {"disturbed": True}
     if path is None:
         results = SurveyResults.in_memory(strategy)
         _trace(results, key, run_tasks, progress)
@@ -254,6 +253,13 @@ def _hits(survey: Survey, scene: Scene | SceneParts) -> Int[np.ndarray, " hits"]
         # With a message that has both extents.
         survey.within(scene)
     return None if is_on_ground.all() else np.flatnonzero(is_on_ground)
+
+
+def _stated_geometry(survey: Survey) -> dict[str, np.ndarray]:
+    """Return position, zenith and azimuth as a survey states them, which light need not see."""
+    if survey.stated is None:
+        return {"position": survey.position, "zenith": survey.zenith, "azimuth": survey.azimuth}
+    return {"position": survey.stated[:, :3], "zenith": survey.stated[:, 3], "azimuth": survey.stated[:, 4]}
 
 
 def _kept_names(keep: Collection[str] | None) -> tuple[str, ...]:

@@ -61,7 +61,7 @@ class Waveforms(eqx.Module):
     - `neglected`, `lost`: (shots, wavelengths), `energy_budget`, `energy_budget_stderr`, dicts of the same
       shape: as those of `Waveform`. `neglected` is zero where one order is followed.
     - `position`: (shots, 2) m, or (shots, 3) of sensors, `zenith`, `azimuth`: (shots,) degrees, as those of
-      `Survey`.
+      `Survey`, or as it states them (`Survey.disturbed`).
     - `ground_height`: (shots,) m, true height of the ground where the beam axis meets it; NaN where it meets
       none.
     - `off_map`: (shots,) fraction of the light that falls outside the voxel map.
@@ -70,11 +70,11 @@ class Waveforms(eqx.Module):
     - `acquisition`: an `Acquisition`, what else discrete returns need; None for files of earlier versions.
     - `info`: dict of "rtol", "orders" followed, "automatic orders" (False where `max_orders` was given),
       "narrow beams" (True where all are narrower than a voxel), "altitude" of the lidar in m (None for
-      sensors), "crs" of the survey and its scene (None if unknown), "seconds" that it took, and whether light
-      was "shared" (over `SceneParts`: in all tiles). Over one scene with shared light, also the spacing in m
-      of the "grid" of nodes at which it entered, and a bound on the fraction of samples that "parallel light"
-      changes. Over `SceneParts`, also the number of "parts", the "margin" in m around tiles, and the "margin
-      of all light", which loses none.
+      sensors), "crs" of the survey and its scene (None if unknown), "disturbed" (True for
+      `Survey.disturbed`), "seconds" that it took, and whether light was "shared" (over `SceneParts`: in all
+      tiles). Over one scene with shared light, also the spacing in m of the "grid" of nodes at which it
+      entered, and a bound on the fraction of samples that "parallel light" changes. Over `SceneParts`, also
+      the number of "parts", the "margin" in m around tiles, and the "margin of all light", which loses none.
 
     **Example:**
 
@@ -152,7 +152,10 @@ class Waveforms(eqx.Module):
     def height_of_shot(self, shot: int) -> Float[np.ndarray, " samples"]:
         """Heights (samples,), m, from which light of order one arrives in the samples of a shot."""
         # The survey has one time axis and shots of many zenith angles: heights differ between shots.
-        height = -0.5 * SPEED_OF_LIGHT * self.time * np.cos(np.deg2rad(self.zenith[shot]))
+        distance = 0.5 * SPEED_OF_LIGHT * self.time
+        if self.has_sensor_position and self.acquisition is not None:
+            distance = distance + self.acquisition.range_at_time_zero[shot]
+        height = -distance * np.cos(np.deg2rad(self.zenith[shot]))
         return height + self.position[shot, 2] if self.has_sensor_position else height
 
     def __len__(self) -> int:

@@ -4,9 +4,11 @@ At the height H, a beam at the angle alpha from the vertical meets flat ground a
 after the slant range H / cos(alpha).
 """
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy.stats
 
 import jaxlidar as jl
 
@@ -229,3 +231,154 @@ def test_shots_have_times_angles_and_flight_lines(tmp_path):
 def test_wrong_times_angles_and_flight_lines_are_refused(fields, message):
     with pytest.raises(ValueError, match=message):
         jl.Survey(jl.Lidar(), [(0, 0), (1, 0)], **fields)
+
+
+# -- errors of geometry ------------------------------------------------------------------------------------
+
+DRONE = jl.Lidar(sensor=(0.0, 0.0, 0.0), divergence=0.5)
+
+
+def strips(*courses, **options):
+    """One strip of eleven shots for each course, 60 m high; roll and pitch are not zero."""
+    flights = []
+    for start, end in courses:
+        ends = np.column_stack([np.array([start, end], float), [60.0, 60.0]])
+        flights.append(jl.Trajectory([0.0, 10.0], ends, roll=3.0, pitch=-2.0))
+    pattern = jl.Oscillating(half_angle=20.0, frequency=0.3)
+    return jl.Survey.fly(flights, pattern, lidar=DRONE, pulse_rate=1.0, **options)
+
+
+@pytest.mark.parametrize(
+    ("boresight", "course", "expected"),
+    [
+        # The right wing is down: the beam goes to the left. The nose is up: it goes ahead.
+        ((0.1, 0.0, 0.0), (0.0, 5.0), (-0.10472, 0.0)),
+        ((0.1, 0.0, 0.0), (0.0, -5.0), (0.10472, 0.0)),
+        ((0.0, 0.1, 0.0), (5.0, 0.0), (0.10472, 0.0)),
+        ((0.0, 0.0, 0.1), (5.0, 0.0), (0.0, 0.0)),
+    ],
+)
+def test_a_boresight_error_moves_a_beam_by_its_angle(boresight, course, expected):
+    """60 m tan(0.1 degrees) is 0.105 m."""
+    flight = jl.Trajectory([0.0, 1.0], [(0, 0, 60), (*course, 60)])
+    strip = jl.Survey.fly(flight, jl.Conical(half_angle=1e-7, frequency=1.0), lidar=DRONE)
+    place = jl.ground_position(strip.disturbed(boresight=boresight), jl.Scene(ground=jl.Ground()))
+    np.testing.assert_allclose(place[0, :2], expected, atol=2e-5)
+
+
+def test_a_boresight_error_is_a_mounting_that_is_not_stated():
+    """`fly` with this mounting is the reference; planted: turns in the frame of the map."""
+    courses = ((0, 0), (30, 40)), ((30, 0), (0, 5))
+    true = strips(*courses).disturbed(boresight=(1.0, -2.0, 3.0))
+    expected = strips(*courses, mounting=(1.0, -2.0, 3.0))
+    np.testing.assert_allclose(true.direction, expected.direction, atol=1e-12)
+    np.testing.assert_array_equal(true.sensor, expected.sensor)
+    stated = strips(*courses)
+    np.testing.assert_array_equal(true.stated[:, :3], stated.sensor)
+    np.testing.assert_array_equal(true.stated[:, 3:5], np.column_stack([stated.zenith, stated.azimuth]))
+    # Of a lidar with an altitude, too, which is then placed by its sensors.
+    high = jl.Survey.scan(jl.Lidar(altitude=HEIGHT), jl.Oscillating(20.0, 30.0), **LINE)
+    true = high.disturbed(boresight=(0.5, 0.0, 0.0))
+    assert true.has_sensor_position
+    np.testing.assert_allclose(true.sensor, high.sensor)
+    angle = np.rad2deg(np.arccos(np.sum(true.direction * high.direction, axis=1)))
+    np.testing.assert_allclose(angle, 0.5, rtol=1e-6)
+
+
+def test_errors_of_position_and_attitude_are_those_of_a_line():
+    """400 lines: sums of squares are chi-squared (level 1e-4 for each of six); planted: errors by shot."""
+    lines = np.repeat(np.arange(400), 5)
+    survey = jl.Survey(DRONE, sensor=np.zeros((2000, 3)), flight_line=lines, attitude=np.zeros((2000, 3)))
+    true = survey.disturbed(position=(0.1, 0.2, 0.3), range=0.05, key=jax.random.key(3))
+    by_line = true.sensor.reshape(400, 5, 3)
+    assert np.all(by_line == by_line[:, :1])
+    error = true.stated[:, 5]
+    for values, deviation in (*zip(by_line[:, 0].T, (0.1, 0.2, 0.3)), (error, 0.05)):
+        probability = scipy.stats.chi2.cdf(np.sum((values / deviation) ** 2), len(values))
+        assert 5e-5 < probability < 1 - 5e-5
+    assert len(np.unique(error)) == 2000
+    # Straight down and heading north, a roll and a pitch move the beam to the west and the north.
+    true = survey.disturbed(attitude=(0.1, 0.2, 0.0), key=jax.random.key(4))
+    west, north = (-true.direction[::5, 0], true.direction[::5, 1])
+    for values, deviation in ((west, 0.1), (north, 0.2)):
+        statistic = np.sum((np.rad2deg(values) / deviation) ** 2)
+        assert 5e-5 < scipy.stats.chi2.cdf(statistic, 400) < 1 - 5e-5
+    again = survey.disturbed(attitude=(0.1, 0.2, 0.0), key=jax.random.key(4))
+    np.testing.assert_array_equal(again.direction, true.direction)
+
+
+def test_stated_geometry_stays_with_its_shots():
+    survey = strips(((0, 0), (30, 40)), ((30, 0), (0, 5)))
+    true = survey.disturbed(boresight=(1.0, 0.0, 0.0), range=0.1, key=jax.random.key(0))
+    part = true.subset(np.array([3, 15]))
+    np.testing.assert_array_equal(part.stated, true.stated[[3, 15]])
+    np.testing.assert_array_equal(part.attitude, true.attitude[[3, 15]])
+    joined = jl.Survey.join([survey, true])
+    np.testing.assert_array_equal(joined.stated[len(survey) :], true.stated)
+    np.testing.assert_array_equal(joined.stated[: len(survey), :3], survey.sensor)
+    assert not joined.stated[: len(survey), 5].any()
+    moved = true.relative_to(np.array([10.0, 20.0]))
+    np.testing.assert_allclose(moved.stated[:, :3], true.stated[:, :3] - [10.0, 20.0, 0.0])
+    np.testing.assert_array_equal(moved.stated[:, 3:], true.stated[:, 3:])
+    # A second error adds to the first; what is stated stays.
+    twice = true.disturbed(boresight=(-1.0, 0.0, 0.0))
+    np.testing.assert_allclose(twice.direction, survey.direction, atol=1e-9)
+    np.testing.assert_array_equal(twice.stated, true.stated)
+
+
+@pytest.mark.parametrize(
+    ("options", "error", "message"),
+    [
+        ({"boresight": 0.1}, ValueError, r"boresight has shape \(\); admissible is \(3,\)"),
+        ({"position": -0.1}, ValueError, r"position = -0.1 is outside"),
+        ({"attitude": (0.1, 0.1)}, ValueError, r"attitude has shape \(2,\)"),
+        ({"range": np.nan}, ValueError, "range"),
+        ({"range": 0.1}, ValueError, "key is None, but errors are to be drawn"),
+        ({"range": 0.1, "key": 3}, TypeError, "key"),
+    ],
+)
+def test_inadmissible_errors_of_geometry_are_refused(options, error, message):
+    with pytest.raises(error, match=message):
+        strips(((0, 0), (30, 40))).disturbed(**options)
+
+
+def test_errors_of_angles_need_an_attitude():
+    survey = jl.Survey(jl.Lidar(), [(0.0, 0.0)])
+    for options in ({"boresight": (0.1, 0, 0)}, {"attitude": 0.1, "key": jax.random.key(0)}):
+        with pytest.raises(ValueError, match=r"the survey has no attitude; .* Survey\.fly"):
+            survey.disturbed(**options)
+    with pytest.raises(ValueError, match="stated is given with position"):
+        jl.Survey(jl.Lidar(), [(0.0, 0.0)], stated=np.zeros((1, 6)))
+    with pytest.raises(ValueError, match=r"stated has shape \(1, 5\)"):
+        jl.Survey(DRONE, sensor=[(0.0, 0.0, 1.0)], stated=np.zeros((1, 5)))
+
+
+def test_strips_disagree_as_their_geometry_does(tmp_path):
+    """Returns lie at s + w (r + e) with the stated s and w, the true range r and its error e.
+
+    Over a slope of 20 degrees, strips of opposite courses differ in height by twice the shift and its slope.
+    """
+    down = jl.Conical(half_angle=1e-7, frequency=1.0)
+    scene = jl.Scene(ground=jl.Ground(height=0.0, slope=20.0, aspect=90.0, reflectance=0.4))
+    flights = [jl.Trajectory([0.0, 4.0], [(0, y, 60), (0, -y, 60)], crs="EPSG:25832") for y in (-10.0, 10.0)]
+    stated = jl.Survey.fly(flights, down, lidar=DRONE, pulse_rate=1.0)
+    true = stated.disturbed(boresight=(0.1, 0.0, 0.0), range=0.02, key=jax.random.key(5))
+    options = {"key": jax.random.key(0), "max_orders": 1, "rtol": 0.05}
+    many = jl.simulate_many(true, scene, path=tmp_path / "strips.zarr", **options)
+    assert many.crs == "EPSG:25832"
+    np.testing.assert_array_equal(many.position, stated.sensor)
+    returns = many.returns()
+    assert len(returns) == len(stated)
+    true_range = np.linalg.norm(jl.ground_position(true, scene) - true.sensor, axis=1)
+    expected = stated.sensor + (true_range + true.stated[:, 5])[:, None] * stated.direction
+    np.testing.assert_allclose(returns.position, expected, atol=2e-3)
+    without_noise = returns.position[:, 2] + true.stated[:, 5]
+    line = returns.flight_line == 1
+    difference = without_noise[line].mean() - without_noise[~line].mean()
+    expected = 2 * 60.0 * np.tan(np.deg2rad(0.1)) * np.tan(np.deg2rad(20.0))
+    np.testing.assert_allclose(abs(difference), expected, atol=2e-3)
+    heights = [many.height_of_shot(3)[many.energy[3, 0].argmax()], returns.position[3, 2]]
+    assert abs(heights[0] - heights[1]) < 0.2
+    again = jl.rerun(tmp_path / "strips.zarr")
+    np.testing.assert_array_equal(again.reflectance, many.reflectance)
+    np.testing.assert_array_equal(again.acquisition.range_at_time_zero, true.stated[:, 5])
