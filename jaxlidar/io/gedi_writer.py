@@ -33,7 +33,7 @@ from jaxlidar._fields.checks import (
 )
 from jaxlidar._fingerprint import version_of
 from jaxlidar.io.checks import MAX_COUNTS, required_for
-from jaxlidar.io.coordinates import GEOGRAPHIC, directions_of_north, metric_system, transform
+from jaxlidar.io.coordinates import GEOGRAPHIC, common_system, directions_of_north, metric_system, transform
 from jaxlidar.io.files import atomic_write
 from jaxlidar.sensors.lidar import Lidar
 from jaxlidar.sensors.receiver import Receiver
@@ -117,7 +117,8 @@ def write_gedi_l1b(
     - `origin`: longitude and latitude of x = y = 0 in degrees, where y is north. Positions are those of the
       azimuthal equidistant projection about it.
     - `crs`: in place of `origin`, the projected coordinate reference system of the survey's positions, in
-      metres, such as "EPSG:32633". Azimuths are turned from its grid's north to true north.
+      metres, such as "EPSG:32633". Azimuths are turned from its grid's north to true north. Default None:
+      that of the survey.
     - `elevation`: that of the reference plane z = 0 above the WGS-84 ellipsoid in m, one number or (shots,).
       Default 0.
     - `beam`: one of the product's eight, such as "BEAM0000", for all shots or for each. Shots lie in the file
@@ -198,6 +199,8 @@ def write_gedi_l1b(
         "tx_egflag": np.ones(shots, np.uint8),
         "tx_pulseflag": np.ones(shots, np.uint8),
     }
+    if origin is None:
+        crs = common_system({"survey": survey.crs, "crs": crs})
     projection = _projection(origin, crs)
     geolocation = _geolocation(survey, first_time, bins, plane_elevation, projection)
     geolocation["solar_elevation"] = np.broadcast_to(np.asarray(solar_elevation, np.float32), (shots,))

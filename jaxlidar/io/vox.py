@@ -75,6 +75,9 @@ def read_vox(
     - `name`: material of the plant area, "leaf" or "bark". Attenuation of bark is taken as it is. Default
       "leaf".
 
+    A file that is placed with a turn, as HELIOS++ does, is read as it is: `VoxelMap.join` turns its map about
+    the lower corner.
+
     **Returns:** a `VoxelsRead`: the `VoxelMap`, and the voxels that were dropped, by reason. The density
     `fill` is that of voxels that no beam sampled ("not sampled"), which sparse maps leave out, and of those
     whose density is not a number ("without a density"). Voxels below the ground ("below the ground") that

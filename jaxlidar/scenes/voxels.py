@@ -9,26 +9,31 @@ The extinction coefficient sigma (1/m) follows from
 """
 
 from collections.abc import Callable, Sequence
-from typing import ClassVar, final
+from typing import ClassVar, NamedTuple, final
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy
+import scipy.sparse
 from jaxtyping import Array, ArrayLike, Float
 
 from jaxlidar._fields.checks import (
     as_array,
+    as_numpy,
     check_kind,
     check_range,
     check_shape,
     concrete,
+    concrete_array,
     coordinates,
     crs_name,
+    has_tracers,
     warn_units,
 )
 from jaxlidar._fields.ranges import Range, check_ranges
+from jaxlidar._jax.memory import machine_memory
 from jaxlidar._registry import common_crs
 from jaxlidar._text import object_text
 from jaxlidar.optics.leaf_angles import LeafAngles
@@ -36,6 +41,10 @@ from jaxlidar.scenes.terrain import Terrain
 
 # Optical depth along one edge of a solid voxel (probability 1): exp(-40) = 4e-18.
 SOLID_OPTICAL_DEPTH = 40.0
+# Faces that differ by less than this fraction of an edge are the same.
+_FACE_TOLERANCE = 1e-6
+# Points along each horizontal edge of a voxel that is turned, and bytes of a voxel while maps are joined.
+_POINTS, _BYTES_PER_VOXEL = 8, 40.0
 
 
 # Numbers, arrays or nested sequences of numbers.
@@ -315,12 +324,169 @@ class VoxelMap(eqx.Module):
         leaf, bark, angles = lifted(self.leaf), lifted(self.bark), self.leaf_angles
         return VoxelMap(leaf, bark, self.voxel_size, corner, angles, crs)
 
+    @staticmethod
+    def join(
+        maps: "Sequence[VoxelMap]", voxel_size: Numbers | None = None, *, azimuth: Numbers = 0.0
+    ) -> "VoxelMap":
+        """Join maps of different places, voxel sizes and turns into one, by resampling.
+
+        Extinction times volume is what is divided among voxels, so that the leaf and bark areas of all maps
+        are conserved; where maps overlap, areas add up. A map that is not turned is divided by the volumes
+        that voxels share: one with the same voxels in the same places stays as it is. A turned one is divided
+        by 8 x 8 points of each voxel. Wood that fills a voxel, with a probability of one, is spread like
+        leaves: where it must stop light, join maps of the same voxels.
+
+        **Arguments:**
+
+        - `maps`: one `VoxelMap` or more, with equal `leaf_angles`.
+        - `voxel_size`: (3,) voxel edges in m, positive, or one number for cubes. Default None: the smallest
+          edges of the maps along each axis.
+        - `azimuth`: degrees by which a map is turned clockwise, seen from above, about its south-west corner,
+          such as those of a rotated .vox file: one number, or one for each map. Default 0.
+
+        **Returns:** a `VoxelMap` that encloses all of them.
+
+        **Raises:** ValueError for no map, sizes and azimuths outside their ranges, leaf angles or a `crs`
+        that differ, more voxels than memory has room for, and within a JAX transformation; TypeError for
+        objects of another kind.
+
+        **Example:** two plots of 4 m2, the second of them turned.
+
+        >>> import numpy as np, jaxlidar as jl
+        >>> near = jl.VoxelMap.from_lad(np.full((2, 2, 1), 1.5), voxel_size=1.0)
+        >>> far = jl.VoxelMap.from_lad(np.full((4, 4, 2), 1.5), voxel_size=0.5, origin=(4.0, 1.0, 0.0))
+        >>> both = jl.VoxelMap.join([near, far], voxel_size=1.0, azimuth=(0.0, 30.0))
+        >>> print(both.shape, f"{float(2 * both.leaf.sum()):.1f} m2, of {1.5 * (4 + 4):.1f}")
+        (7, 3, 1) 12.0 m2, of 12.0
+        """
+        check_kind("maps", maps, Sequence, "several VoxelMap, as in [voxels, other]")
+        for voxels in maps:
+            check_kind("one of maps", voxels, VoxelMap, "a VoxelMap")
+        if not len(maps):
+            raise ValueError("maps is empty; admissible is one VoxelMap or more")
+        if has_tracers(list(maps)):
+            raise ValueError("a JAX transformation is tracing a map: join maps outside")
+        for number, voxels in enumerate(maps):
+            if not eqx.tree_equal(voxels.leaf_angles, maps[0].leaf_angles):
+                raise ValueError(
+                    f"maps[{number}].leaf_angles differ from those of maps[0]; admissible are equal"
+                )
+        crs = common_crs({f"maps[{number}]": voxels.crs for number, voxels in enumerate(maps)})
+        check_range("azimuth", azimuth)
+        check_shape("azimuth", azimuth, (), (len(maps),))
+        turns = np.broadcast_to(as_numpy(azimuth, "azimuth"), (len(maps),))
+        sizes = np.array([concrete_array(voxels.voxel_size) for voxels in maps], float)
+        size = sizes.min(axis=0)
+        if voxel_size is not None:
+            size = np.asarray(_triple("voxel_size")(voxel_size), float)
+            check_range("voxel_size", size, 0.0, low_open=True)
+        places = [_Place.of(voxels, float(turn)) for voxels, turn in zip(maps, turns)]
+        # Faces lie at multiples of the edges from the corner of the first map.
+        first, low = places[0].origin, np.min([place.low for place in places], axis=0)
+        high = np.max([place.high for place in places], axis=0)
+        steps = np.floor((low - first) / size + _FACE_TOLERANCE)
+        shape = np.maximum(np.ceil((high - first) / size - _FACE_TOLERANCE) - steps, 1).astype(int)
+        n_voxels, most = float(shape.prod(dtype=float)), machine_memory() / _BYTES_PER_VOXEL
+        if n_voxels > most:
+            raise ValueError(
+                f"maps lie within {(high - low).tolist()} m, which are {n_voxels:.3g} voxels of "
+                f"{size.tolist()} m; admissible are at most {most:.3g} on this machine: are their "
+                "coordinates those of one map?"
+            )
+        origin = first + steps * size
+        extinction = {}
+        for name in ("leaf", "bark"):
+            values = [(place, getattr(voxels, name)) for place, voxels in zip(places, maps)]
+            total = [
+                place.resampled(concrete_array(k), origin, size, tuple(shape.tolist()))
+                for place, k in values
+                if k is not None
+            ]
+            extinction[name] = np.sum(total, axis=0) if total else None
+        return VoxelMap(
+            **extinction, voxel_size=size, origin=origin, leaf_angles=maps[0].leaf_angles, crs=crs
+        )
+
     def mean_extinction(self) -> Float[np.ndarray, "nx ny nz"]:
         """Sum the extinction coefficients of leaf (at G = 1/2) and bark.
 
         **Returns:** (nx, ny, nz) NumPy array in 1/m.
         """
         return np.sum([np.asarray(a) for a in (self.leaf, self.bark) if a is not None], axis=0)
+
+
+class _Place(NamedTuple):
+    """Where the voxels of a map lie: its corner and edges, m, its shape, and its turn, degrees clockwise.
+
+    `low`, `high`: corners of the box around it, m.
+    """
+
+    origin: Float[np.ndarray, "3"]
+    size: Float[np.ndarray, "3"]
+    shape: tuple[int, int, int]
+    turn: float
+    low: Float[np.ndarray, "3"]
+    high: Float[np.ndarray, "3"]
+
+    @staticmethod
+    def of(voxels: VoxelMap, turn: float) -> "_Place":
+        origin, size = (np.asarray(concrete_array(a), float) for a in (voxels.origin, voxels.voxel_size))
+        end = size * voxels.shape
+        corners = np.array([[0.0, 0.0], [end[0], 0.0], [0.0, end[1]], end[:2]])
+        turned = _turned(corners, turn)
+        low, high = (np.append(f(turned, axis=0), z) for f, z in ((np.min, 0.0), (np.max, end[2])))
+        return _Place(origin, size, voxels.shape, turn, origin + low, origin + high)
+
+    def resampled(
+        self,
+        extinction: Float[np.ndarray, "nx ny nz"],
+        origin: Float[np.ndarray, "3"],
+        size: Float[np.ndarray, "3"],
+        shape: tuple[int, int, int],
+    ) -> Float[np.ndarray, "mx my mz"]:
+        """Return extinction coefficients, 1/m, on another grid with the same integral over space."""
+        nx, ny, nz = self.shape
+        faces = [o + d * np.arange(n + 1) for o, d, n in zip(self.origin, self.size, self.shape)]
+        layers = _shares(faces[2], origin[2], size[2], shape[2])
+        if self.turn % 360.0 == 0.0:
+            columns = scipy.sparse.kron(*(_shares(faces[k], origin[k], size[k], shape[k]) for k in range(2)))
+        else:
+            # Points in each column, as fractions of its edges.
+            point = (np.arange(_POINTS) + 0.5) / _POINTS
+            x, y = (self.size[k] * np.add.outer(np.arange((nx, ny)[k]), point) for k in range(2))
+            places = np.stack(np.broadcast_arrays(x[:, None, :, None], y[None, :, None, :]), axis=-1)
+            places = self.origin[:2] + _turned(places.reshape(-1, 2), self.turn)
+            # Rounding may put a point at a face just outside.
+            target = np.floor((places - origin[:2]) / size[:2]).astype(int)
+            i, j = np.clip(target, 0, np.array(shape[:2]) - 1).T
+            target = i * shape[1] + j
+            source = np.repeat(np.arange(nx * ny), _POINTS**2)
+            weights = np.full(len(target), 1.0 / _POINTS**2)
+            columns = scipy.sparse.coo_array((weights, (target, source)), (shape[0] * shape[1], nx * ny))
+        amount = extinction.reshape(nx * ny, nz).astype(float) * self.size.prod()
+        amount = columns.tocsr() @ (layers.tocsr() @ amount.T).T
+        return amount.reshape(shape) / size.prod()
+
+
+def _turned(points: Float[np.ndarray, "n 2"], azimuth: float) -> Float[np.ndarray, "n 2"]:
+    """Turn horizontal positions clockwise about the origin, by degrees."""
+    cosine, sine = np.cos(np.deg2rad(azimuth)), np.sin(np.deg2rad(azimuth))
+    return points @ np.array([[cosine, -sine], [sine, cosine]])
+
+
+def _shares(faces: Float[np.ndarray, " n"], origin: float, size: float, count: int) -> scipy.sparse.coo_array:
+    """Return the share of each interval between faces that lies in each of `count` cells of a size."""
+    lowest = np.floor((faces[:-1] - origin) / size + _FACE_TOLERANCE).astype(int)
+    most = int(np.ceil((faces[1] - faces[0]) / size)) + 1
+    cells = lowest[:, None] + np.arange(most)
+    overlap = np.minimum(faces[1:, None], origin + size * (cells + 1)) - np.maximum(
+        faces[:-1, None], origin + size * cells
+    )
+    share = np.maximum(overlap / np.diff(faces)[:, None], 0.0)
+    share[share < _FACE_TOLERANCE] = 0.0
+    share /= share.sum(axis=1, keepdims=True)
+    number, k = np.nonzero(share)
+    return scipy.sparse.coo_array((share[number, k], (cells[number, k], number)), (count, len(faces) - 1))
 
 
 @jax.jit
