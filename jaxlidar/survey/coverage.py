@@ -180,7 +180,7 @@ def _shots_within(survey: Survey, scene: Scene, margin: float) -> Bool[np.ndarra
     common_crs({"survey": survey.crs, "scene": scene.crs})
     ground, box = scene.ground, _box(scene)
     is_within, extent = shots_on_ground(survey, scene, margin), box
-    if isinstance(ground, Terrain) and ground.sides == "open":
+    if isinstance(ground, Terrain) and ground.relief and ground.sides == "open":
         extent = np.stack([concrete_array(ground.origin), ground.end])
         if survey.has_sensor_position:
             place = ground_position(survey, scene)[:, :2]

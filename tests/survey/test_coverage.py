@@ -112,7 +112,12 @@ def test_without_open_terrain_shots_are_clipped_to_canopy_and_meshes(ground):
         survey.within(scene, margin=3.0)
     # What has no end clips nothing.
     periodic = jl.Canopy(voxels, leaf=jl.LeafOptics(0.4, 0.4), sides="periodic")
-    for endless in (jl.Scene(ground=jl.Ground()), jl.Scene(canopy=periodic, ground=ground)):
+    plane = jl.Terrain(relief().heights, 1.0, relief=False)
+    for endless in (
+        jl.Scene(ground=jl.Ground()),
+        jl.Scene(canopy=periodic, ground=ground),
+        jl.Scene(ground=plane),
+    ):
         assert len(survey.within(endless)) == 6
 
 
