@@ -1,7 +1,9 @@
 """Pages of documentation: their examples run, their links have targets, and the API reference builds."""
 
+import json
 import pkgutil
 import re
+import runpy
 import shlex
 import subprocess
 import sys
@@ -108,6 +110,13 @@ def test_the_front_page_is_short_and_its_commands_are_two():
     assert survey <= 20
     for picture in re.findall(r"!\[[^]]*\]\(([^)]+)\)", page.read_text()):
         assert (ROOT / picture).stat().st_size < 150_000
+
+
+def test_the_front_page_has_the_measured_time_of_its_survey():
+    folder = ROOT / "examples" / "figures"
+    record = json.loads((folder / "hectare.json").read_text())
+    duration = runpy.run_path(str(folder / "hectare.py"))["duration"]
+    assert (ROOT / "README.md").read_text().count(duration(record)) == 1
 
 
 def test_the_example_of_a_new_law_is_the_tested_one():

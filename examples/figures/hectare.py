@@ -1,4 +1,6 @@
-"""Draw the hectare of README.md: run it as `python examples/figures/hectare.py`.
+"""Measure and draw the hectare of README.md: `python examples/figures/hectare.py`, on an idle machine.
+
+The time goes into `hectare.json`, into the picture and into the sentence of README.md before the example.
 
 The truth of RH98 is that of level ground below the same trees, an instant pulse and single scattering: each
 voxel returns the intercepted light times the two-way transmittance above it, each column weighted by the
@@ -6,6 +8,8 @@ irradiance of the footprint.
 """
 
 import contextlib
+import json
+import os
 import re
 import tempfile
 import time
@@ -20,6 +24,7 @@ import numpy as np
 from jaxlidar.io import atomic_write
 
 FOLDER = Path(__file__).resolve().parent
+PAGE = FOLDER.parents[1] / "README.md"
 # Intensity factor of backscatter of spherically oriented leaves, per reflectance.
 SPHERICAL = 2.0 / 3.0
 
@@ -44,6 +49,11 @@ def true_rh98(stand, canopy, survey, ground: float) -> np.ndarray:
         energy = np.concatenate([[np.sum(light * ground_return)], np.einsum("xy,xyz->z", light, returned)])
         heights.append(np.interp(0.98, np.cumsum(energy) / energy.sum(), faces))
     return np.array(heights)
+
+
+def duration(record: dict) -> str:
+    """Return what the front page says of the time that its survey takes."""
+    return f"It takes {record['seconds']:.0f} s on {record['cores']} cores:"
 
 
 def draw(names: dict, seconds: float):
@@ -86,16 +96,20 @@ def draw(names: dict, seconds: float):
 
 
 def main() -> None:
-    """Run the survey of the front page as it is printed and save its picture."""
-    page = (FOLDER.parents[1] / "README.md").read_text()
+    """Run the survey of the front page as it is printed; write its time and its picture."""
+    page = PAGE.read_text()
     code = re.findall(r"^```python\n(.*?)^```", page, re.MULTILINE | re.DOTALL)[3]
     names: dict = {}
     start = time.perf_counter()
     with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder):
         exec(code, names)
-    figure = draw(names, time.perf_counter() - start)
+    record = {"seconds": round(time.perf_counter() - start, 1), "cores": os.cpu_count()}
+    with atomic_write(FOLDER / "hectare.json") as draft:
+        draft.write_text(json.dumps(record) + "\n")
+    with atomic_write(PAGE) as draft:
+        draft.write_text(re.sub(r"It takes \d+ s on \d+ cores:", duration(record), page))
     with atomic_write(FOLDER / "hectare.png") as draft:
-        figure.savefig(draft, dpi=80, format="png")
+        draw(names, record["seconds"]).savefig(draft, dpi=80, format="png")
 
 
 if __name__ == "__main__":
