@@ -154,7 +154,7 @@ def test_the_reference_builds_without_a_warning_and_its_links_have_targets(tmp_p
 
 
 def test_the_benchmarks_page_is_made_from_their_records():
-    code = "import make_readme; print(make_readme.page(), end='')"
+    code = "import run; print(run.page(), end='')"
     folder = ROOT / "examples" / "benchmarks"
     process = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, cwd=folder, check=True

@@ -1,29 +1,36 @@
-"""Shared by the benchmarks: record of the machine, timing in turns, tables and atomic file writes."""
+"""The frame of the benchmarks: the machine, timing in turns, the record, the figure, and text in Markdown."""
 
-import argparse
 import json
 import os
 import platform
+import resource
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 
 import jax
 import matplotlib
+import numpy as np
 
 from jaxlidar.io import atomic_write
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
+from matplotlib.ticker import LogLocator, NullFormatter
+
+COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 
 
-def options(description: str, **defaults: int) -> argparse.Namespace:
-    """Parse the command line: `--out` for the folder, and an integer option for each of `defaults`."""
-    parser = argparse.ArgumentParser(description=description)
-    parser.add_argument("--out", default="figures", type=Path, help="folder of the results")
-    for name, value in defaults.items():
-        parser.add_argument(f"--{name}", default=value, type=int)
-    return parser.parse_args()
+def crown_extinction(n: int, height: float = 6.0) -> np.ndarray:
+    """Return random extinction coefficients, 0.5 1/m on average, in a sphere of radius 3.5 m.
+
+    - `n`: voxels along a side of a cube of 10 m. - `height`: of the middle of the sphere above the lowest
+    voxels, m.
+    """
+    centres = 10.0 * (np.arange(n) + 0.5) / n
+    x, y, z = np.meshgrid(centres, centres, centres, indexing="ij")
+    inside = (x - 5.0) ** 2 + (y - 5.0) ** 2 + (z - height) ** 2 < 3.5**2
+    return np.where(inside, np.random.default_rng(0).uniform(0.0, 1.0, inside.shape), 0.0)
 
 
 def machine() -> dict[str, object]:
@@ -62,6 +69,11 @@ def seconds(function: Callable, *arguments) -> float:
     return time.perf_counter() - start
 
 
+def first_and_warm(run: Callable[[], object], rounds: int) -> tuple[float, float]:
+    """Return the seconds of the first call, which compiles, and of the fastest of `rounds` others."""
+    return seconds(run), min(seconds(run) for _ in range(rounds))
+
+
 def race(contestants: Mapping[str, Callable[[], object]], rounds: int) -> dict[str, list[float]]:
     """Return the times of all contestants by rounds.
 
@@ -82,6 +94,16 @@ def best(times: Mapping[str, list[float]]) -> dict[str, float]:
     return {name: min(values) for name, values in times.items()}
 
 
+def show_progress(state: object) -> None:
+    """Print the state of a long run over the one before."""
+    print(f"\r{state}", end="", flush=True)
+
+
+def peak_gigabytes() -> float:
+    """Return the largest memory that the process has taken so far."""
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
+
+
 def write_json(path: Path, record: Mapping[str, object]) -> None:
     """Write a record, atomically."""
     with atomic_write(path) as draft:
@@ -93,6 +115,13 @@ def new_figure(columns: int = 1, size: tuple[float, float] = (6, 4), rows: int =
     return plt.subplots(rows, columns, figsize=size, layout="constrained")
 
 
+def label_log_axis(axis, *digits: int) -> None:
+    """Label an axis of few powers of ten at these digits of each, with plain numbers."""
+    axis.set_major_locator(LogLocator(subs=digits))
+    axis.set_major_formatter("{x:g}")
+    axis.set_minor_formatter(NullFormatter())
+
+
 def save_figure(figure, path: Path) -> None:
     """Write a figure as PNG, atomically."""
     with atomic_write(path) as draft:
@@ -100,12 +129,41 @@ def save_figure(figure, path: Path) -> None:
     plt.close(figure)
 
 
-def print_table(header: tuple[str, ...], rows: list[tuple]) -> None:
-    """Print rows below a header, numbers to three significant digits."""
-    text = [header, *(tuple(f"{c:.3g}" if isinstance(c, float) else str(c) for c in row) for row in rows)]
-    widths = [max(len(row[i]) for row in text) for i in range(len(header))]
-    for n, row in enumerate(text):
-        cells = [row[0].ljust(widths[0]), *(c.rjust(w) for c, w in zip(row[1:], widths[1:]))]
-        print("  ".join(cells).rstrip())
-        if n == 0:
-            print("  ".join("-" * w for w in widths))
+def number(x: float | None, digits: int = 2) -> str:
+    """Format a number with some significant digits; an empty string for None."""
+    if x is None:
+        return ""
+    short = f"{x:.{digits}g}"
+    return f"{float(short):,g}" if 1e-3 <= abs(x) < 1e6 else short
+
+
+def percent(fraction: float, digits: int = 2) -> str:
+    """Format a fraction in percent, with some significant digits."""
+    return f"{number(100 * fraction, digits)} %"
+
+
+def table(rows: Iterable, columns: Mapping[str, str | Mapping | Callable]) -> str:
+    """Return a table in Markdown.
+
+    `columns`: by heading the key of the rows, the values by row, or a function of a row. Integers are written
+    in full, other numbers with two significant digits.
+    """
+
+    def cell(row, column: str | Mapping | Callable) -> str:
+        if isinstance(column, str):
+            value = row[column]
+        elif isinstance(column, Mapping):
+            value = column[row]
+        else:
+            value = column(row)
+        if isinstance(value, int):
+            return f"{value:,}"
+        return value if isinstance(value, str) else number(value)
+
+    lines = [[cell(row, column) for column in columns.values()] for row in rows]
+    return "\n".join(f"| {' | '.join(line)} |" for line in (columns, ["---"] * len(columns), *lines))
+
+
+def page_of(*paragraphs: str) -> str:
+    """Join paragraphs and tables by empty lines."""
+    return "\n\n".join(paragraphs)

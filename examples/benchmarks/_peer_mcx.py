@@ -14,10 +14,10 @@ import ctypes
 import os
 import sys
 import tempfile
-import time
 from pathlib import Path
 
 import numpy as np
+from _peer import read_task, repeated, write_result
 
 SPEED_OF_LIGHT = 0.299792458  # m/ns
 END_TIME = 120  # ns; no light returns later
@@ -42,8 +42,8 @@ def load():
 
 
 def main() -> None:
-    """Run `repeats` times; the command line names files of arrays for the task and the results."""
-    task = dict(np.load(sys.argv[1]))
+    """Run `repeats` times."""
+    task = read_task()
     pmcxcl = load()
     size, albedo, altitude = (float(task[n]) for n in ("size", "albedo", "altitude"))
     # Layers count from the top. Medium 0 is vacuum; each level of extinction is one further medium.
@@ -91,7 +91,8 @@ def main() -> None:
     range_correction = (half_way / (altitude - size + layer_depth[:, None])) ** 2
     edges = task["start"] + task["fine"] * np.arange(int(task["count"]) + 1)
 
-    def wave(flux: np.ndarray) -> np.ndarray:
+    def wave(seed: int) -> np.ndarray:
+        flux = np.asarray(pmcxcl.run({**settings, "seed": 1 + seed})["flux"])
         # Per mm2 and s to per m2 and gate.
         by_depth = np.einsum("xyz,xyzt->zt", weight, flux) * 1e6 * 1e-9 * width * range_correction
         total = np.zeros(edges.size - 1)
@@ -100,19 +101,9 @@ def main() -> None:
             total += np.diff(np.interp(edges, opened, np.concatenate([[0.0], np.cumsum(row)])))
         return total
 
-    waves, times = [], []
-    for seed in range(int(task["repeats"]) + 1):
-        wall_start, cpu_start = time.perf_counter(), time.process_time()
-        result = pmcxcl.run({**settings, "seed": 1 + seed})
-        waves.append(wave(np.asarray(result["flux"])))
-        times.append((time.perf_counter() - wall_start, time.process_time() - cpu_start))
-    np.savez(
-        sys.argv[2],
-        version=f"pmcxcl {pmcxcl.__version__} on {pmcxcl.gpuinfo()[0]['name']}",
-        alone_waves=np.array(waves[1:]),
-        alone_times=np.array(times[1:]),
-        alone_first=times[0][0],
-    )
+    waves, times, first = repeated(wave, int(task["repeats"]))
+    version = f"pmcxcl {pmcxcl.__version__} on {pmcxcl.gpuinfo()[0]['name']}"
+    write_result(version=version, alone_waves=waves, alone_times=times, alone_first=first)
 
 
 if __name__ == "__main__":

@@ -17,10 +17,10 @@ import inspect
 import os
 import sys
 import tempfile
-import time
 from pathlib import Path
 
 import numpy as np
+from _peer import read_task, repeated, write_result
 
 PLUGIN, CORRECTED_PLUGIN = "transient_prbvolpath", "transient_prbvolpath_all_stretches"
 LENGTH_LINE = "dr.select(act_medium_scatter, mei.t"
@@ -190,8 +190,8 @@ def scenes(mi, task, plugin: str):
 
 
 def main() -> None:
-    """Render every case `repeats` times; the command line names files for the task and the results."""
-    task = dict(np.load(sys.argv[1]))
+    """Render every case `repeats` times."""
+    task = read_task()
     mi, mitransient = load()
     corrected = register_corrected_plugin()
     register_beam(mi, task)
@@ -203,15 +203,14 @@ def main() -> None:
     range_correction = (1 + 0.5 * SPEED_OF_LIGHT * bin_time / distance) ** 2
     samples = int(task["mitransient_samples"])
     for case, target in scenes(mi, task, CORRECTED_PLUGIN if corrected else PLUGIN):
-        waves, times = [], []
-        for seed in range(int(task["repeats"]) + 1):
-            wall_start, cpu_start = time.perf_counter(), time.process_time()
+
+        def render(seed: int, target=target) -> np.ndarray:
             _, image = target.integrator().render(target, seed=seed, spp=samples)
-            waves.append(np.array(image).ravel() * range_correction)
-            times.append((time.perf_counter() - wall_start, time.process_time() - cpu_start))
-        out[f"{case}_waves"], out[f"{case}_times"] = np.array(waves[1:]), np.array(times[1:])
-        out[f"{case}_first"] = times[0][0]
-    np.savez(sys.argv[2], **out)
+            return np.array(image).ravel() * range_correction
+
+        names = (f"{case}_waves", f"{case}_times", f"{case}_first")
+        out |= dict(zip(names, repeated(render, int(task["repeats"]))))
+    write_result(**out)
 
 
 if __name__ == "__main__":

@@ -3,18 +3,16 @@
 Sensor, light and crown are those of `_peer_mitransient.py`, with a film that has no bins of time.
 """
 
-import sys
-import time
-
 import numpy as np
+from _peer import read_task, repeated_gradient, write_result
 from _peer_mitransient import crown, load, register_beam
 
 EXTINCTION = "box.interior_medium.sigma_t.data"
 
 
 def main() -> None:
-    """Render and differentiate `repeats` times; the command line names files for the task and the results."""
-    task = dict(np.load(sys.argv[1]))
+    """Render and differentiate `repeats` times."""
+    task = read_task()
     mi, _ = load()
     import drjit as dr
 
@@ -38,18 +36,8 @@ def main() -> None:
         dr.disable_grad(extinction)
         return float(np.array(loss).ravel()[0]), slopes
 
-    out: dict[str, object] = {"version": f"Mitsuba {mi.__version__}"}
-    for name, function in (("simulation", render), ("gradient", gradient)):
-        results, times = [], []
-        for seed in range(int(task["repeats"]) + 1):
-            wall_start, cpu_start = time.perf_counter(), time.process_time()
-            results.append(function(seed))
-            times.append((time.perf_counter() - wall_start, time.process_time() - cpu_start))
-        out[f"{name}_times"], out[f"{name}_first"] = np.array(times[1:]), times[0][0]
-        if name == "gradient":
-            out["totals"] = np.array([total for total, _ in results[1:]])
-            out["gradients"] = np.array([slopes for _, slopes in results[1:]], np.float32)
-    np.savez(sys.argv[2], **out)
+    repeats = int(task["repeats"])
+    write_result(version=f"Mitsuba {mi.__version__}", **repeated_gradient(render, gradient, repeats))
 
 
 if __name__ == "__main__":

@@ -1,7 +1,5 @@
 """Cost of accuracy: error against a converged reference, wall time and memory, by each setting.
 
-Run it as `python examples/benchmarks/accuracy_cost.py [--out figures] [--batches 64] [--photons 2048]`.
-
 Errors are root mean squares over the samples of 1 ns above 1 % of the peak, relative, at 1064 nm, on four
 scenes: sloping ground, a plate over ground, an L-system tree, and a dense stand of leaf area index 6. Times
 are those of batches on all cores, warm. The error of n batches is measured on groups of n. The time to a
@@ -17,24 +15,25 @@ import dataclasses
 import os
 import runpy
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import equinox as eqx
 import jax
 import numpy as np
-from _common import machine, options, plt, print_table, save_figure, write_json
+from _common import COLOURS, new_figure, number, page_of, plt, table
 
 import jaxlidar as jl
 
+TITLE = "Cost of accuracy"
+QUICK = {"batches": 4, "photons": 16, "n_scenes": 2}
 # The estimator of the paper.
 ANALOG = runpy.run_path(str(Path(__file__).resolve().parents[1] / "paper" / "_analog.py"))
 LIDAR = jl.Lidar(wavelength=1064.0, divergence=5.0)
 CONE = 10.0
 TARGETS = (0.1, 0.01, 0.001)
 LEAF = jl.LeafOptics(reflectance=0.45, transmittance=0.45)
-COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 POOL = ThreadPoolExecutor(os.cpu_count() or 1)
 
 
@@ -205,7 +204,7 @@ def convergence_order(knob: Sequence[float], error: Sequence[float], floor: floa
     )
 
 
-def sweep(name, values, make, reference):
+def sweep(name: str, values: Sequence[float], make: Callable, reference: np.ndarray) -> dict:
     """Run a setting through its values; `make(value)` returns case, plan and True for double precision."""
     points = []
     for value in values:
@@ -221,51 +220,54 @@ def sweep(name, values, make, reference):
             }
         )
     slope = convergence_order([p["value"] for p in points], [p["error"] for p in points])
-    print(
-        f"{name}: "
-        + ", ".join(f"{p['value']:g}: {p['error']:.1e} in {1e3 * p['seconds']:.3g} ms" for p in points)
-    )
     return {"knob": name, "order": slope, "points": points}
 
 
 def deterministic(all_cases: dict[str, AccuracyCase]) -> dict[str, dict]:
     """Return the errors of settings that are not random, each by itself."""
-    knobs = {}
     ground, stand, tree = (all_cases[n] for n in ("ground", "dense stand", "tree"))
-    finest = run_batches(ground, 1, ground.plan(bin_width=1 / 64), x64=True).mean
-    knobs["fine bin (ns)"] = sweep(
-        "fine bin (ns)", (1.0, 0.5, 0.25, 0.125), lambda v: (ground, ground.plan(bin_width=v), True), finest
-    )
     single = {"max_orders": 1, "footprint": "fixed"}
-    fine_rays = run_batches(tree, 1, tree.plan(**single, n_rays=131072)).mean
-    knobs["rays"] = sweep(
-        "rays",
-        (64, 256, 1024, 4096, 16384),
-        lambda v: (tree, tree.plan(**single, n_rays=v), False),
-        fine_rays,
-    )
-    fine_steps = run_batches(stand, 1, stand.plan(**single, n_rays=64, max_step=0.03), x64=True).mean
-    knobs["step (m)"] = sweep(
-        "step (m)",
-        (10.0, 2.5, 0.6, 0.15),
-        lambda v: (stand, stand.plan(**single, n_rays=64, max_step=v), False),
-        fine_steps,
-    )
-    knobs["bits"] = sweep(
-        "bits",
-        (32, 64),
-        lambda v: (stand, stand.plan(**single, n_rays=64, max_step=0.15), v == 64),
-        fine_steps,
-    )
     voxels = {size: dataclasses.replace(tree, scene=tree_scene(size)) for size in (0.125, 0.25, 0.5, 1.0)}
+    finest = run_batches(ground, 1, ground.plan(bin_width=1 / 64), x64=True).mean
+    fine_rays = run_batches(tree, 1, tree.plan(**single, n_rays=131072)).mean
+    fine_steps = run_batches(stand, 1, stand.plan(**single, n_rays=64, max_step=0.03), x64=True).mean
     fine_voxels = run_batches(voxels[0.125], 1, voxels[0.125].plan(**single)).mean
-    knobs["voxel (m)"] = sweep(
-        "voxel (m)", (1.0, 0.5, 0.25), lambda v: (voxels[v], voxels[v].plan(**single), False), fine_voxels
+    sweeps = (
+        (
+            "fine bin (ns)",
+            (1.0, 0.5, 0.25, 0.125),
+            lambda v: (ground, ground.plan(bin_width=v), True),
+            finest,
+        ),
+        (
+            "rays",
+            (64, 256, 1024, 4096, 16384),
+            lambda v: (tree, tree.plan(**single, n_rays=v), False),
+            fine_rays,
+        ),
+        (
+            "step (m)",
+            (10.0, 2.5, 0.6, 0.15),
+            lambda v: (stand, stand.plan(**single, n_rays=64, max_step=v), False),
+            fine_steps,
+        ),
+        (
+            "bits",
+            (32, 64),
+            lambda v: (stand, stand.plan(**single, n_rays=64, max_step=0.15), v == 64),
+            fine_steps,
+        ),
+        (
+            "voxel (m)",
+            (1.0, 0.5, 0.25),
+            lambda v: (voxels[v], voxels[v].plan(**single), False),
+            fine_voxels,
+        ),
     )
-    return knobs
+    return {name: sweep(name, *settings) for name, *settings in sweeps}
 
 
-def random_knobs(name: str, case: AccuracyCase, batches: int, photons: int) -> dict:
+def random_knobs(case: AccuracyCase, batches: int, photons: int) -> dict:
     """Return errors and times of the default, one deposit a flight, fewer orders and analog photons."""
     size = {"n_photons": 8 * photons, "n_rays": 1024}
     plan = case.plan(**size)
@@ -282,10 +284,6 @@ def random_knobs(name: str, case: AccuracyCase, batches: int, photons: int) -> d
         "memory": {key: r.memory for key, r in runs.items()},
         "compiled_in": runs["default"].compiled_in,
     }
-    for key, points in record["curves"].items():
-        slope = convergence_order([p["seconds"] for p in points], [p["error"] for p in points])
-        falls = slope if isinstance(slope, str) else f"slope {slope:.2f}"
-        print(f"{name}, {key}: {points[-1]['error']:.2g} in {points[-1]['seconds']:.3g} s, {falls}")
     orders = []
     for n in (1, 2, 3, 4, 6, 8, 12):
         if n < case.orders:
@@ -293,7 +291,6 @@ def random_knobs(name: str, case: AccuracyCase, batches: int, photons: int) -> d
             error = relative(fewer.mean, reference)
             orders.append({"value": n, "error": error, "seconds": fewer.seconds, "memory": fewer.memory})
     record["orders"] = orders
-    print(f"{name}, orders: " + ", ".join(f"{p['value']}: {p['error']:.1e}" for p in orders))
     bias = bias_of(runs["default"], long)
     record["bias"] = bias
     record["times"] = {
@@ -323,10 +320,20 @@ def plot_curves(ax, curves, x: str, y: str = "error", scales: str = "loglog", sk
         getattr(ax, scales)([p[x] for p in points], [p[y] for p in points], "o-", color=colour, label=label)
 
 
-def draw_record(record: dict, path) -> None:
+def measure(batches: int = 64, photons: int = 2048, n_scenes: int = 4) -> dict:
+    """Return errors and times of the first scenes, and of settings that are not random."""
+    all_cases = cases()
+    scenes = {
+        name: ground_times(case, photons) if case.orders == 1 else random_knobs(case, batches, photons)
+        for name, case in list(all_cases.items())[:n_scenes]
+    }
+    return {"targets": TARGETS, "scenes": scenes, "knobs": deterministic(all_cases)}
+
+
+@plt.rc_context({"legend.fontsize": 7, "legend.frameon": False, "lines.markersize": 4})
+def draw(record: dict):
     """Draw error over time on each scene, then the settings."""
-    plt.rcParams.update({"legend.fontsize": 7, "legend.frameon": False, "lines.markersize": 4})
-    figure, axes = plt.subplots(3, 4, figsize=(12, 8.5), layout="constrained")
+    figure, axes = new_figure(4, (12, 8.5), 3)
     for ax in axes.flat:
         ax.set_ylabel("relative error")
     for ax, (name, results) in zip(axes[0], record["scenes"].items()):
@@ -360,33 +367,34 @@ def draw_record(record: dict, path) -> None:
     plot_curves(axes[2, 3], [(key, knobs[key]) for key in chosen], "seconds")
     axes[2, 3].set(xlabel="seconds", ylim=(1e-7, 1e3))
     axes[2, 3].legend(loc="upper left")
-    save_figure(figure, path)
+    return figure
 
 
-def main() -> None:
-    arguments = options("Cost of accuracy.", batches=64, photons=2048)
-    all_cases = cases()
-    record = {"targets": TARGETS, "scenes": {}, "knobs": deterministic(all_cases)}
-    for name, case in all_cases.items():
-        if case.orders == 1:
-            record["scenes"][name] = ground_times(case, arguments.photons)
-        else:
-            record["scenes"][name] = random_knobs(name, case, arguments.batches, arguments.photons)
-    write_json(arguments.out / "accuracy_cost.json", {"machine": machine(), **record})
-    draw_record(record, arguments.out / "accuracy_cost.png")
+def section(record: dict) -> str:
+    def time_to_target(number_of_target: int):
+        def cell(name: str) -> str:
+            elapsed, is_extrapolated = record["scenes"][name]["times"]["ours"][number_of_target]
+            return (
+                "not reached" if elapsed is None else f"{'~' if is_extrapolated else ''}{number(elapsed)} s"
+            )
 
-    def cell(pair):
-        return "not reached" if pair[0] is None else f"{'~' if pair[1] else ''}{pair[0]:.2g} s"
+        return cell
 
-    rows = []
-    for name, results in record["scenes"].items():
-        for i, target in enumerate(TARGETS):
-            ours, analog = results["times"]["ours"][i], results["times"]["analog"][i]
-            ratio = analog[0] / ours[0] if ours[0] and analog[0] else float("nan")
-            rows.append((name, f"{100 * target:g} %", cell(ours), cell(analog), ratio))
-    print_table(("scene", "error", "ours", "analog", "ratio"), rows)
-    print_table(("knob", "order of convergence"), [(k, v["order"]) for k, v in record["knobs"].items()])
+    def times_longer(name: str) -> str:
+        times = record["scenes"][name]["times"]
+        ratios = [a / o for (a, _), (o, _) in zip(times["analog"], times["ours"]) if a and o]
+        return ", ".join(map(number, ratios)) + " times longer"
 
-
-if __name__ == "__main__":
-    main()
+    scenes = {
+        "scene": str,
+        **{f"{100 * target:g} %": time_to_target(n) for n, target in enumerate(record["targets"])},
+        "the estimator of the paper takes": times_longer,
+    }
+    knobs = {"setting": str, "error falls as the power": lambda name: record["knobs"][name]["order"]}
+    return page_of(
+        "Seconds to a target error (root mean square over samples above 1 % of the peak, relative, at 1064 "
+        "nm), and how much longer the estimator of the paper takes, target by target.",
+        table(record["scenes"], scenes),
+        "Effect of each setting: errors of the first order against the finest value of the setting.",
+        table(record["knobs"], knobs),
+    )

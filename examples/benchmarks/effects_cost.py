@@ -1,7 +1,5 @@
 """Time saved by plans: scenes with the plan of their own effects, and with all effects on.
 
-Run it as `python examples/benchmarks/effects_cost.py [--out figures] [--rounds 9] [--percent 1]`.
-
 "Everything on" is the same scene as a general simulator would trace it, with the code for effects that the
 scene lacks: a voxel canopy with leaf and bark, empty where the scene has none, that rays and photons
 traverse; all scattering orders that its leaves require; air that hardly absorbs or scatters; a receiver that
@@ -18,10 +16,12 @@ import dataclasses
 
 import jax
 import numpy as np
-from _common import best, machine, new_figure, options, print_table, race, save_figure, seconds, write_json
+from _common import best, crown_extinction, new_figure, page_of, race, seconds, table
 
 import jaxlidar as jl
 
+TITLE = "Time saved by plans"
+QUICK = {"rounds": 1, "percent": 20}
 N, SIZE = 32, 10.0
 WINDOW = (-90.0, 59.0)
 LIDAR = jl.Lidar(divergence=3.0)
@@ -33,14 +33,12 @@ GROUND = jl.Ground(reflectance=0.3)
 
 def canopy(leaf: float | None, bark: float | None) -> jl.Canopy:
     """Return a crown of 7 m on a trunk of 1 m, with mean extinctions in 1/m; zero is empty, None absent."""
-    centres = (np.arange(N) + 0.5) * SIZE / N
-    x, y, z = np.meshgrid(centres, centres, centres, indexing="ij")
-    crown = (x - 5) ** 2 + (y - 5) ** 2 + (z - 6) ** 2 < 3.5**2
+    crown = crown_extinction(N)
+    x, y, z = SIZE / N * (np.indices(crown.shape) + 0.5)
     trunk = ((x - 5) ** 2 + (y - 5) ** 2 < 0.25) & (z < 6)
-    random = np.random.default_rng(0).uniform(0, 2, crown.shape)
     voxels = jl.VoxelMap.from_extinction(
-        leaf=None if leaf is None else np.where(crown, leaf * random, 0.0),
-        bark=None if bark is None else np.where(trunk, 10 * bark, np.where(crown, 0.1 * bark, 0.0)),
+        leaf=None if leaf is None else leaf / 0.5 * crown,
+        bark=None if bark is None else np.where(trunk, 10 * bark, np.where(crown > 0, 0.1 * bark, 0.0)),
         voxel_size=SIZE / N,
         origin=(-5.0, -5.0, 0.0),
     )
@@ -70,89 +68,75 @@ def scenes() -> dict[str, tuple[jl.Lidar, jl.Scene, jl.Scene, dict[str, bool]]]:
     }
 
 
-def main() -> None:
-    arguments = options("Time saved by plans.", rounds=9, percent=1)
-    results, rows = [], []
+def measure(rounds: int = 9, percent: int = 1) -> dict:
+    """Return the times of each scene with its plan and with everything on, to a tolerance."""
+    results = []
     for name, (lidar, scene, full_scene, off) in scenes().items():
 
-        def runs(lidar, scene, plan):
-            return lambda: (
-                jl.simulate(
-                    lidar, scene, key=jax.random.key(0), rtol=0.01 * arguments.percent, plan=plan
-                ).reflectance
-            )
+        def simulation(lidar, scene, plan):
+            key, rtol = jax.random.key(0), 0.01 * percent
+            return lambda: jl.simulate(lidar, scene, key=key, rtol=rtol, plan=plan).reflectance
 
         general_plan = jl.plan(SEES_ALL, full_scene, window=WINDOW)
         orders = general_plan.orders if scene.canopy or scene.plates else None
-        common = {
-            "window": WINDOW,
-            "bin_width": general_plan.bins.width,
-            "max_orders": None if off else orders,
-        }
-        scene_plan = jl.plan(lidar, scene, effects=off, **common)
+        scene_plan = jl.plan(
+            lidar,
+            scene,
+            effects=off,
+            window=WINDOW,
+            bin_width=general_plan.bins.width,
+            max_orders=None if off else orders,
+        )
         contestants = {
-            "plan": runs(lidar, scene, scene_plan),
-            "everything": runs(SEES_ALL, full_scene, general_plan),
+            "plan": simulation(lidar, scene, scene_plan),
+            "everything": simulation(SEES_ALL, full_scene, general_plan),
         }
         # Compile programs that scenes share for each scene, for comparable first calls.
         jax.clear_caches()
         cold = {which: seconds(run) for which, run in contestants.items()}
-        times = best(race(contestants, arguments.rounds))
+        times = best(race(contestants, rounds))
         sums = {which: float(run().sum()) for which, run in contestants.items()}
         if not off:
-            np.testing.assert_allclose(sums["plan"], sums["everything"], rtol=0.02)
-        ratio = times["everything"] / times["plan"]
+            np.testing.assert_allclose(sums["plan"], sums["everything"], rtol=0.02 * percent)
         results.append(
             {
                 "scene": name,
                 "seconds": times,
                 "seconds_with_compilation": cold,
-                "ratio": ratio,
+                "ratio": times["everything"] / times["plan"],
                 "reflectance": sums,
                 "orders": {"plan": scene_plan.orders, "everything": general_plan.orders},
             }
         )
-        orders_text = f"{scene_plan.orders} / {general_plan.orders}"
-        rows.append(
-            (name, orders_text, 1e3 * times["plan"], 1e3 * times["everything"], ratio, *cold.values())
-        )
-    record = {
-        "machine": machine(),
-        "percent": arguments.percent,
-        "rounds": arguments.rounds,
-        "scenes": results,
-    }
-    write_json(arguments.out / "effects_cost.json", record)
+    return {"percent": percent, "rounds": rounds, "scenes": results}
 
+
+def draw(record: dict):
+    """Draw the time of each scene with its plan and with everything on."""
     figure, axes = new_figure(size=(7, 4))
+    results = record["scenes"]
     places = np.arange(len(results))
     for shift, which, label in ((-0.2, "plan", "its plan"), (0.2, "everything", "everything on")):
         axes.barh(places + shift, [1e3 * r["seconds"][which] for r in results], 0.4, label=label)
-    for place, r in zip(places, results):
-        longest = 1e3 * max(r["seconds"].values())
-        axes.text(1.15 * longest, place, f"{r['ratio']:.3g}x", va="center")
-    axes.set(
-        xscale="log",
-        xlim=(1, 5e3 * max(max(r["seconds"].values()) for r in results)),
-        xlabel="ms, warm",
-        title="One waveform",
-    )
+    longest = [1e3 * max(r["seconds"].values()) for r in results]
+    for place, end, r in zip(places, longest, results):
+        axes.text(1.15 * end, place, f"{r['ratio']:.3g}x", va="center")
+    axes.set(xscale="log", xlim=(1, 5 * max(longest)), xlabel="ms, warm", title="One waveform")
     axes.set_yticks(places, [r["scene"] for r in results])
     axes.invert_yaxis()
     axes.legend(loc="lower center", bbox_to_anchor=(0.5, -0.35), ncols=2, frameon=False)
-    save_figure(figure, arguments.out / "effects_cost.png")
+    return figure
 
-    header = (
-        "scene",
-        "orders",
-        "ms, plan",
-        "ms, everything",
-        "ratio",
-        "s, plan, cold",
-        "s, everything, cold",
+
+def section(record: dict) -> str:
+    columns = {
+        "scene": "scene",
+        "plan of the scene, s": lambda r: r["seconds"]["plan"],
+        "everything on, s": lambda r: r["seconds"]["everything"],
+        "times longer": "ratio",
+    }
+    return page_of(
+        f"To {record['percent']} %: the plan of the scene, and a plan with everything on (empty voxels, all "
+        "orders, air, field of view, jitter ...).",
+        table(record["scenes"], columns),
     )
-    print_table(header, rows)
-
-
-if __name__ == "__main__":
-    main()

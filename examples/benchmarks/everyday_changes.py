@@ -1,21 +1,20 @@
 """Cost of changing a scene: the first call, and calls after everyday changes.
 
-Run it as `python examples/benchmarks/everyday_changes.py [--out figures]`. Every change is made to two
-scenes, and the slower call counts. Every call is timed twice; the second time is its work without
-compilation. Programs compiled are counted as XLA reports them.
+Every change is made to two scenes, and the slower call counts. Every call is timed twice; the second time is
+its work without compilation. Programs compiled are counted as XLA reports them.
 """
 
 import logging
 import re
-import time
 import warnings
 
 import jax
 import numpy as np
-from _common import machine, new_figure, options, print_table, save_figure, write_json
+from _common import first_and_warm, new_figure, page_of, table
 
 import jaxlidar as jl
 
+TITLE = "Cost of changing a scene"
 CHANGES = {
     "first call": {},
     "rtol 0.05 to 0.02": {"rtol": 0.02},
@@ -39,6 +38,7 @@ SCENES = (
     {},
     {"shape": (12, 12, 16), "zenith": 3.0, "slope": 2.0, "length": 4.0, "window": None, "rtol": 0.1},
 )
+QUICK = {"n_changes": 2}
 # Seconds; shorter compilations are those of single operations.
 NOTABLE = 0.1
 
@@ -88,43 +88,53 @@ def simulate(
     jl.simulate(lidar, scene, key=jax.random.key(0), rtol=rtol, window=window)
 
 
-def main() -> None:
-    arguments = options("Cost of changing a scene.")
+def measure(n_changes: int = len(CHANGES)) -> dict:
+    """Return the times of a call after each of the first changes, and the programs that it compiles."""
     warnings.simplefilter("ignore", jl.LateLightWarning)
     compilations = Compilations()
     logger = logging.getLogger("jax")
     logger.addHandler(compilations)
     logger.propagate = False
     jax.config.update("jax_log_compiles", True)
-    calls: dict[str, list[dict]] = {name: [] for name in CHANGES}
+    calls: dict[str, list[dict]] = {name: [] for name in list(CHANGES)[:n_changes]}
     for scene in SCENES:
-        for name, changes in CHANGES.items():
+        for name, of_scenes in calls.items():
             compilations.compiled.clear()
-            times = []
-            for _ in range(2):
-                start = time.perf_counter()
-                simulate(**{**scene, **changes})
-                times.append(time.perf_counter() - start)
+            settings = {**scene, **CHANGES[name]}
+            first, warm = first_and_warm(lambda settings=settings: simulate(**settings), 1)
             notable = [what for what, elapsed in compilations.compiled if elapsed > NOTABLE]
-            calls[name].append({"seconds": times[0], "warm": times[1], "compiled": notable})
-    worst = {name: max(of_scenes, key=lambda call: call["seconds"]) for name, of_scenes in calls.items()}
-    results = [{"change": name, **call} for name, call in worst.items()]
-    write_json(arguments.out / "everyday_changes.json", {"machine": machine(), "changes": results})
+            of_scenes.append({"seconds": first, "warm": warm, "compiled": notable})
+    slowest = {name: max(of_scenes, key=lambda call: call["seconds"]) for name, of_scenes in calls.items()}
+    return {"changes": [{"change": name, **call} for name, call in slowest.items()]}
 
+
+def draw(record: dict):
+    """Draw the seconds of each call, and of the same call repeated."""
     figure, axes = new_figure(size=(7, 5))
-    names = [r["change"] for r in results]
-    axes.barh(names, [r["seconds"] for r in results], label="with compilation")
-    axes.barh(names, [r["warm"] for r in results], label="again")
+    names = [r["change"] for r in record["changes"]]
+    for quantity, label in (("seconds", "with compilation"), ("warm", "again")):
+        axes.barh(names, [r[quantity] for r in record["changes"]], label=label)
     axes.invert_yaxis()
     axes.set(xlabel="seconds", title="a call of simulate after a change", xscale="log")
     ticks = (0.2, 0.5, 1, 2, 5, 10)
     axes.set_xticks(ticks, [f"{t:g}" for t in ticks])
     axes.minorticks_off()
     axes.legend()
-    save_figure(figure, arguments.out / "everyday_changes.png")
-    rows = [(r["change"], r["seconds"], r["warm"], ", ".join(r["compiled"])) for r in results]
-    print_table(("change", "s", "s, again", "compiled"), rows)
+    return figure
 
 
-if __name__ == "__main__":
-    main()
+def section(record: dict) -> str:
+    columns = {
+        "change": "change",
+        "s": "seconds",
+        "s, repeated": "warm",
+        "programs compiled": lambda r: ", ".join(f"`{name}`" for name in r["compiled"]),
+    }
+    return page_of(
+        "Seconds of a call of `simulate` with three wavelengths after one change, and of the same call "
+        "repeated; of two scenes the slower one. Array sizes are rounded up to size buckets, and numbers are "
+        "arguments of compiled programs: the trace (`batch_of_trace_first`, `batch_of_trace_higher`) is "
+        "compiled anew where a size changes its bucket, as that of a record whose pulse, window or beam "
+        "changes may, and where an effect is new.",
+        table(record["changes"], columns),
+    )

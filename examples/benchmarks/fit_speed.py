@@ -1,7 +1,5 @@
 """Fits of the same targets by `inversion.retrieve` and by `scipy.optimize.least_squares`.
 
-Run it as `python examples/benchmarks/fit_speed.py [--out figures] [--targets 12] [--photons 65536]`.
-
 Scene and unknowns are those of `retrieval_coverage.py`: seven unknowns, three of them geometric, three
 wavelengths, four orders. Both use the same compiled simulation with the same random numbers and start in the
 middle of the bounds; the record counts the fits that end at the same chi-squared, to 0.5. scipy uses finite
@@ -11,16 +9,14 @@ unknowns, for which `retrieve` traces once.
 """
 
 import os
+import statistics
 import time
 from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path
 
 import equinox as eqx
 import jax
 import numpy as np
-import scipy.optimize
-from _common import machine, new_figure, options, print_table, save_figure, write_json
-from matplotlib.ticker import LogLocator, NullFormatter
+from _common import label_log_axis, new_figure, number, page_of, table
 from retrieval_coverage import LIDAR, NOISE, RANGES, plan_of, scene_of, unknowns
 
 import inversion
@@ -28,32 +24,36 @@ import jaxlidar as jl
 from inversion.fit.unknowns import bind_unknowns, set_values
 from jaxlidar.planning.plan import MIN_BATCHES
 
+TITLE = "Fits against scipy"
+QUICK = {"targets": 1, "photons": 1024}
 OPTICAL = ("Cab", "Cw", "N", "ground brightness")
 
 
-def main() -> None:
-    arguments = options("Speed of fits.", targets=12, photons=65536)
-    plan = plan_of(arguments.photons // MIN_BATCHES)
+def measure(targets: int = 12, photons: int = 65536) -> dict:
+    """Return the times of fits of all and of optical unknowns, and where they end."""
+    import scipy.optimize
+
+    plan = plan_of(photons // MIN_BATCHES)
     key = jax.random.key(3)
     pool = ThreadPoolExecutor(os.cpu_count() or 1)
     random = np.random.default_rng(5)
     middle = {name: 0.5 * sum(b) for name, (b, _) in RANGES.items()}
-    rows, record = [], {}
+    fits = {}
     for case, chosen in (("all seven", tuple(RANGES)), ("four optical", OPTICAL)):
         chosen_unknowns = [u for u in unknowns() if u.name in chosen]
         times: dict[str, list[float]] = {"ours": [], "scipy": []}
         counts: dict[str, list[int]] = {"ours": [], "scipy": []}
         chi2_differences = []
         # The first target compiles and does not count.
-        for number in range(arguments.targets + 1):
+        for target in range(targets + 1):
             truth = {name: float(random.uniform(*r)) for name, (_, r) in RANGES.items()}
             base = scene_of({**truth, **{name: middle[name] for name in chosen}})
             wave = jl.simulate(
                 LIDAR,
                 scene_of(truth),
-                key=jax.random.key(100 + number),
+                key=jax.random.key(100 + target),
                 plan=plan,
-                n_photons=arguments.photons,
+                n_photons=photons,
             )
             sigma = NOISE * np.asarray(wave.reflectance, float).max(axis=1, keepdims=True)
             observed = np.asarray(wave.reflectance, float)
@@ -80,7 +80,7 @@ def main() -> None:
             low, high = (np.array([float(getattr(s, f)) for s in bound_unknowns]) for f in ("low", "high"))
             residuals(low + 0.5 * (high - low))
             start = time.perf_counter()
-            theirs = scipy.optimize.least_squares(
+            scipy_fit = scipy.optimize.least_squares(
                 residuals,
                 [float(s.start) for s in bound_unknowns],
                 bounds=(low, high),
@@ -92,56 +92,21 @@ def main() -> None:
                 gtol=1e-4,
             )
             seconds = time.perf_counter() - start
-            if number == 0:
+            if target == 0:
                 continue
             fit_chi2 = np.sum(residuals([float(fit.values[s.name]) for s in bound_unknowns]) ** 2)
-            chi2_differences.append(float(fit_chi2 - 2 * theirs.cost))
+            chi2_differences.append(float(fit_chi2 - 2 * scipy_fit.cost))
             times["ours"].append(ours)
             times["scipy"].append(seconds)
             counts["ours"].append(fit.steps)
-            counts["scipy"].append(int(theirs.nfev + theirs.njev * len(bound_unknowns)))
-        ratio = float(np.median(np.array(times["scipy"]) / np.array(times["ours"])))
-        record[case] = {
+            counts["scipy"].append(int(scipy_fit.nfev + scipy_fit.njev * len(bound_unknowns)))
+        fits[case] = {
             "seconds": times,
             "simulations": counts,
-            "ratio": ratio,
+            "ratio": float(np.median(np.array(times["scipy"]) / np.array(times["ours"]))),
             "chi2_ours_minus_scipy": chi2_differences,
         }
-        rows.append(
-            (
-                case,
-                np.median(times["ours"]),
-                np.median(times["scipy"]),
-                ratio,
-                max(chi2_differences),
-                min(chi2_differences),
-            )
-        )
-    print_table(("unknowns", "ours, s", "scipy, s", "ratio", "chi2, ours - scipy, most", "least"), rows)
-    written = {
-        "machine": machine(),
-        "photons": arguments.photons,
-        "targets": arguments.targets,
-        "fits": record,
-    }
-    write_json(arguments.out / "fit_speed.json", written)
-    draw(record, arguments.out / "fit_speed.png")
-
-
-def draw(record: dict, path: Path) -> None:
-    """Draw the seconds of every fit by scipy over those of `retrieve`."""
-    figure, axes = new_figure()
-    for case, r in record.items():
-        axes.loglog(r["seconds"]["ours"], r["seconds"]["scipy"], "o", label=case)
-    limits = axes.get_xlim()
-    axes.plot(limits, [10 * b for b in limits], color="0.7", label="ten times")
-    for axis in (axes.xaxis, axes.yaxis):
-        axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-        axis.set_major_formatter("{x:g}")
-        axis.set_minor_formatter(NullFormatter())
-    axes.set(xlabel="inversion.retrieve (s)", ylabel="scipy.optimize.least_squares (s)")
-    axes.legend()
-    save_figure(figure, path)
+    return {"photons": photons, "targets": targets, "fits": fits}
 
 
 @eqx.filter_jit
@@ -150,5 +115,35 @@ def _simulated(scene, plan, setters, values, key):
     return jl.total_reflectance(jl.trace_scene(setup, key, reverse=False), setup)
 
 
-if __name__ == "__main__":
-    main()
+def draw(record: dict):
+    """Draw the seconds of every fit by scipy over those of `retrieve`."""
+    figure, axes = new_figure()
+    for case, r in record["fits"].items():
+        axes.loglog(r["seconds"]["ours"], r["seconds"]["scipy"], "o", label=case)
+    limits = axes.get_xlim()
+    axes.plot(limits, [10 * b for b in limits], color="0.7", label="ten times")
+    for axis in (axes.xaxis, axes.yaxis):
+        label_log_axis(axis, 1, 2, 5)
+    axes.set(xlabel="inversion.retrieve (s)", ylabel="scipy.optimize.least_squares (s)")
+    axes.legend()
+    return figure
+
+
+def section(record: dict) -> str:
+    def gaps(case: str) -> list[float]:
+        return record["fits"][case]["chi2_ours_minus_scipy"]
+
+    columns = {
+        "unknowns": str,
+        "retrieve, s": lambda case: statistics.median(record["fits"][case]["seconds"]["ours"]),
+        "scipy, s": lambda case: statistics.median(record["fits"][case]["seconds"]["scipy"]),
+        "times faster": lambda case: record["fits"][case]["ratio"],
+        "same": lambda case: sum(abs(gap) < 0.5 for gap in gaps(case)),
+        "excess": lambda case: ", ".join(number(-gap) for gap in sorted(gaps(case)) if abs(gap) >= 0.5),
+    }
+    return page_of(
+        f"Both use the same simulation of {record['photons']:,} photons; medians of {record['targets']} "
+        'targets. "Same" counts the fits that end at the same chi-squared, to 0.5; "excess" lists by how '
+        "much the chi-squared of scipy is larger in each of the others.",
+        table(record["fits"], columns),
+    )

@@ -1,7 +1,5 @@
 """Gradients in every voxel against one simulation, by `jax.grad` of `simulate`: time, memory, compilation.
 
-Run it as `python examples/benchmarks/gradient_cost.py [--out figures] [--rounds 3]`.
-
 A map of 20 m x 20 m x 20 m of leaves over ground, in 20^3 and in 100^3 voxels, at first order and with eight
 orders, seen from nadir by a beam of 10 m. The gradient is that of a linear function of the waveform with
 respect to the leaf area density of every voxel. Compared are programs of `jax.jit`: `simulate`, and
@@ -17,12 +15,13 @@ import time
 import jax
 import jax.numpy as jnp
 import numpy as np
-from _common import machine, new_figure, options, print_table, save_figure, write_json
+from _common import best, new_figure, page_of, table
 
 import jaxlidar as jl
 
+TITLE = "Gradients in every voxel"
+QUICK = {"photons": 64, "rays": 64, "rounds": 1, "finest": 20}
 SIZE, ORDERS = 20.0, 8
-CASES = [(side, orders) for side in (20, 100) for orders in (1, ORDERS)]
 KEY = jax.random.key(0)
 # A single call of a few ms is near the resolution of the processor's clock.
 SPAN = 0.5
@@ -76,19 +75,60 @@ def processor_seconds(program, lad) -> float:
     return (time.process_time() - start) / calls
 
 
-def names_of(cases: list[dict]) -> list[str]:
-    """Return the name of each case."""
-    return [f"{c['side']}³ voxels, {c['orders']} order{'s' * (c['orders'] > 1)}" for c in cases]
+def cost_of_case(side: int, orders: int, photons: int, rays: int, rounds: int) -> dict:
+    """Return the times of simulation and gradient, with all voxels and with half of them, and memory."""
+    lad, simulate, as_called, gradient = problem(side, orders, photons, rays)
+    programs, costs = {}, {}
+    for name, function in {"simulation": simulate, "gradient": gradient}.items():
+        programs[name], costs[name] = compiled(function, lad)
+    half_empty = lad * (np.random.default_rng(1).uniform(size=lad.shape) < 0.5)
+    contestants = {
+        **{name: (program, lad) for name, program in programs.items()},
+        "simulate, as called": (as_called, lad),
+        **{f"{name}, half empty": (program, half_empty) for name, program in programs.items()},
+    }
+    times: dict[str, list[float]] = {name: [] for name in contestants}
+    for program, values in contestants.values():
+        jax.block_until_ready(program(values, KEY))
+    for _ in range(rounds):
+        for name, (program, values) in contestants.items():
+            times[name].append(processor_seconds(program, values))
+    fastest = best(times)
+    lad, _, _, gradient = problem(side, orders, 4 * photons, 4 * rays)
+    _, more = compiled(gradient, lad)
+    return {
+        "side": side,
+        "orders": orders,
+        "seconds": {name: fastest[name] for name in ("simulation", "gradient", "simulate, as called")},
+        "ratio": fastest["gradient"] / fastest["simulation"],
+        "ratio_half_empty": fastest["gradient, half empty"] / fastest["simulation, half empty"],
+        "ratio_as_called": fastest["gradient"] / fastest["simulate, as called"],
+        "compilation": {name: cost["compilation"] for name, cost in costs.items()},
+        "tracing": {name: cost["tracing"] for name, cost in costs.items()},
+        "MB": costs["gradient"]["MB"],
+        "MB_simulation": costs["simulation"]["MB"],
+        "MB_four_times_the_photons": more["MB"],
+        "MB_voxels": lad.size * lad.dtype.itemsize / 1e6,
+    }
 
 
-def draw(cases: list[dict]):
+def measure(photons: int = 8192, rays: int = 1024, rounds: int = 3, finest: int = 100) -> dict:
+    """Return the costs of maps of 20^3 and `finest`^3 voxels; photons and rays are those of a batch."""
+    cases = [(side, orders) for side in dict.fromkeys((20, finest)) for orders in (1, ORDERS)]
+    rows = [cost_of_case(*case, photons, rays, rounds) for case in cases]
+    return {"photons": 8 * photons, "rays": 8 * rays, "cases": rows}
+
+
+def draw(record: dict):
     """Draw the time of each gradient over that of a simulation."""
     figure, axes = new_figure(size=(7, 3))
+    cases = record["cases"]
     place = np.arange(len(cases))
     axes.barh(place - 0.2, [c["ratio"] for c in cases], 0.4, label="leaves everywhere")
     axes.barh(place + 0.2, [c["ratio_half_empty"] for c in cases], 0.4, label="half of the voxels empty")
     axes.axvline(3.0, color="black", linestyle="--", label="three simulations")
-    axes.set_yticks(place, names_of(cases))
+    names = [f"{c['side']}³ voxels, {c['orders']} order{'s' * (c['orders'] > 1)}" for c in cases]
+    axes.set_yticks(place, names)
     axes.set(xlabel="times one simulation", title="Gradient in every voxel")
     # The first case on top, and room for the legend beside the bars.
     axes.invert_yaxis()
@@ -97,79 +137,24 @@ def draw(cases: list[dict]):
     return figure
 
 
-def main() -> None:
-    arguments = options("Cost of a gradient in every voxel.", photons=8192, rays=1024, rounds=3)
-    cases = []
-    for side, orders in CASES:
-        lad, simulate, as_called, gradient = problem(side, orders, arguments.photons, arguments.rays)
-        programs, costs = {}, {}
-        for name, function in {"simulation": simulate, "gradient": gradient}.items():
-            programs[name], costs[name] = compiled(function, lad)
-        programs["simulate, as called"] = as_called
-        times: dict[str, list[float]] = {name: [] for name in programs}
-        for program in programs.values():
-            jax.block_until_ready(program(lad, KEY))
-        half_empty = lad * (np.random.default_rng(1).uniform(size=lad.shape) < 0.5)
-        times_half_empty: dict[str, list[float]] = {"simulation": [], "gradient": []}
-        for _ in range(arguments.rounds):
-            for name, program in programs.items():
-                times[name].append(processor_seconds(program, lad))
-            for name, values in times_half_empty.items():
-                values.append(processor_seconds(programs[name], half_empty))
-        fastest = {name: min(values) for name, values in times.items()}
-        fastest_half_empty = {name: min(values) for name, values in times_half_empty.items()}
-        lad, _, _, gradient = problem(side, orders, 4 * arguments.photons, 4 * arguments.rays)
-        _, more = compiled(gradient, lad)
-        cases.append(
-            {
-                "side": side,
-                "orders": orders,
-                "seconds": fastest,
-                "ratio": fastest["gradient"] / fastest["simulation"],
-                "ratio_half_empty": fastest_half_empty["gradient"] / fastest_half_empty["simulation"],
-                "ratio_as_called": fastest["gradient"] / fastest["simulate, as called"],
-                "compilation": {name: cost["compilation"] for name, cost in costs.items()},
-                "tracing": {name: cost["tracing"] for name, cost in costs.items()},
-                "MB": costs["gradient"]["MB"],
-                "MB_simulation": costs["simulation"]["MB"],
-                "MB_four_times_the_photons": more["MB"],
-                "MB_voxels": lad.size * lad.dtype.itemsize / 1e6,
-            }
-        )
-    record = {
-        "machine": machine(),
-        "photons": 8 * arguments.photons,
-        "rays": 8 * arguments.rays,
-        "cases": cases,
+def section(record: dict) -> str:
+    columns = {
+        "voxels": lambda c: f"{c['side']}³",
+        "orders": "orders",
+        "CPU s": lambda c: c["seconds"]["gradient"],
+        "simulations": "ratio",
+        "half the voxels empty": "ratio_half_empty",
+        "calls of `simulate`": "ratio_as_called",
+        "MB": "MB",
+        "MB, four times the photons": "MB_four_times_the_photons",
+        "compilation, s": lambda c: c["compilation"]["gradient"],
+        "times that of a simulation": lambda c: c["compilation"]["gradient"] / c["compilation"]["simulation"],
     }
-    write_json(arguments.out / "gradient_cost.json", record)
-    save_figure(draw(cases), arguments.out / "gradient_cost.png")
-    print_table(
-        (
-            "",
-            "s",
-            "times one",
-            "half empty",
-            "times one, as called",
-            "MB",
-            "MB, 4 times as many",
-            "compiled, s",
-        ),
-        [
-            (
-                name,
-                c["seconds"]["gradient"],
-                c["ratio"],
-                c["ratio_half_empty"],
-                c["ratio_as_called"],
-                c["MB"],
-                c["MB_four_times_the_photons"],
-                c["compilation"]["gradient"],
-            )
-            for name, c in zip(names_of(cases), cases)
-        ],
+    return page_of(
+        "The gradient of a function of the waveform with respect to the leaf area density of every voxel, "
+        f"with its value, by `jax.grad` of `simulate(..., plan=)`: {record['photons']:,} photons, "
+        f"{record['rays']:,} rays. Times are compared with a compiled simulation of the same photons, and "
+        "with `simulate` as it is called outside of a transformation. Where voxels are empty, photons are "
+        "traced once more for what leaves there would scatter. Memory is that of temporaries.",
+        table(record["cases"], columns),
     )
-
-
-if __name__ == "__main__":
-    main()

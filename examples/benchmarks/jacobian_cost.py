@@ -1,7 +1,5 @@
 """Jacobians of the waveform in eight unknowns and in 20 layers against one simulation, same photons and keys.
 
-Run it as `python examples/benchmarks/jacobian_cost.py [--out figures] [--photons 65536] [--rounds 5]`.
-
 Four unknowns are optical (Cab, Cw, N of the leaf, reflectance of the ground), four geometric (height and
 slope of the ground, size of the voxels, leaf area). "structured" pushes only the geometric tangents
 through the trace, together, and gets the optical columns from the traced response; "jacfwd" pushes all
@@ -17,7 +15,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from _common import best, machine, new_figure, options, print_table, race, save_figure, write_json
+from _common import best, crown_extinction, new_figure, page_of, race, table
 
 import inversion
 import jaxlidar as jl
@@ -25,6 +23,8 @@ from inversion.fit.model import ForwardModel
 from inversion.fit.unknowns import bind_unknowns
 from jaxlidar.planning.plan import MIN_BATCHES
 
+TITLE = "Jacobians of a waveform"
+QUICK = {"photons": 1024, "rounds": 1}
 N, SIZE, ORDERS, LAYERS = 32, 10.0, 10, 20
 RADIUS, MIDDLE = 3.5, 5.0
 OPTICAL = ("Cab", "Cw", "N", "ground reflectance")
@@ -45,22 +45,18 @@ def scene_at(optical, geometric, extinction) -> jl.Scene:
     )
 
 
-def main() -> None:
-    arguments = options("Cost of a Jacobian.", photons=65536, rounds=5)
+def measure(photons: int = 65536, rounds: int = 5) -> dict:
+    """Return the times of Jacobians, and how far columns are from those of `jax.jacfwd`."""
     centres = (np.arange(N) + 0.5) * SIZE / N
-    x, y, z = np.meshgrid(centres, centres, centres, indexing="ij")
-    inside = sum((v - MIDDLE) ** 2 for v in (x, y, z)) < RADIUS**2
     # Layer of each level of voxels.
     layer = np.clip((centres - MIDDLE + RADIUS) / (2.0 * RADIUS) * LAYERS, 0, LAYERS - 1).astype(int)
-    extinction = jnp.asarray(
-        np.where(inside, 0.5 * np.random.default_rng(0).uniform(0, 2, inside.shape), 0.0)
-    )
+    extinction = jnp.asarray(crown_extinction(N, MIDDLE))
     lidar = jl.Lidar(wavelength=(532.0, 1064.0, 1550.0), divergence=10.0)
     plan = jl.plan(
         lidar,
         scene_at(*START, extinction),
         max_orders=ORDERS,
-        n_photons=arguments.photons,
+        n_photons=photons,
         n_rays=8192 // MIN_BATCHES,
     )
 
@@ -128,9 +124,8 @@ def main() -> None:
         f"{LAYERS} layers": lambda: model(np.ones(LAYERS)),
         f"{LAYERS} layers, jvp": over_batches(layer_columns),
     }
-    times = race(contestants, arguments.rounds)
+    times = race(contestants, rounds)
     fastest = best(times)
-    ratio = {name: t / fastest["simulation"] for name, t in fastest.items()}
 
     _, optical_part, geometric_part = contestants["all 8, structured"]()[0]
     jacfwd_columns = contestants["all 8, jacfwd"]()[0]
@@ -138,34 +133,33 @@ def main() -> None:
         float(jnp.max(jnp.abs(a - b)) / jnp.max(jnp.abs(b)))
         for a, b in zip((optical_part, geometric_part), jacfwd_columns)
     )
-    record = {
-        "machine": machine(),
-        "photons": arguments.photons,
+    return {
+        "photons": photons,
         "orders": ORDERS,
         "unknowns": {"optical": OPTICAL, "geometric": GEOMETRIC},
         "seconds": fastest,
         "seconds_median": {name: float(np.median(t)) for name, t in times.items()},
-        "times_one_simulation": ratio,
+        "times_one_simulation": {name: t / fastest["simulation"] for name, t in fastest.items()},
         "structured_against_jacfwd": difference,
     }
-    write_json(arguments.out / "jacobian_cost.json", record)
 
+
+def draw(record: dict):
+    """Draw the time of each Jacobian over that of a simulation."""
     figure, axes = new_figure(size=(7, 3))
+    ratio = record["times_one_simulation"]
     names = list(ratio)[::-1]
     axes.barh(names, [ratio[n] for n in names])
     axes.axvline(5.0, color="black", linestyle="--", label="five simulations")
-    axes.set(xlabel="times one simulation", title=f"Jacobian, {arguments.photons} photons, {ORDERS} orders")
+    axes.set(xlabel="times one simulation", title=f"Jacobian, {record['photons']} photons, {ORDERS} orders")
     axes.legend()
-    save_figure(figure, arguments.out / "jacobian_cost.png")
-
-    medians = record["seconds_median"]
-    print_table(
-        ("", "s, best", "s, median", "times one"), [(n, fastest[n], medians[n], ratio[n]) for n in fastest]
-    )
-    print(f"eight unknowns cost {ratio['all 8, structured']:.2f} simulations (wanted: at most 5)")
-    print(f"{LAYERS} layers cost {ratio[f'{LAYERS} layers']:.2f} (wanted: at most 5)")
-    print(f"structured against jacfwd: {difference:.1e} of the largest derivative")
+    return figure
 
 
-if __name__ == "__main__":
-    main()
+def section(record: dict) -> str:
+    columns = {
+        "columns": str,
+        "s": record["seconds"],
+        "simulations": record["times_one_simulation"],
+    }
+    return page_of(f"{record['photons']:,} photons.", table(record["seconds"], columns))

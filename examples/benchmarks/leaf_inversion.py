@@ -1,34 +1,28 @@
 """Traits of measured leaves by `inversion.invert_leaves`, against scipy with prosail, same leaves and bands.
 
-Run it as `python examples/benchmarks/leaf_inversion.py FILE [--also FILE ...] [--out figures] [--rounds 3]`.
+`--set files=FILE,FILE` names files (.npz) of leaves as of the ANGERS database: `wavelength_nm`, `R` and `T`
+(leaves, wavelengths), of 1 nm steps, and the chemistry `leaf_chltot_per_area`, `leaf_cartot_per_area`
+(ug/cm2), `leaf_water_thickness` (cm) and `leaf_mass_per_area` (g/cm2). Both fit N, Cab, Car, Cant, Cbrown, Cw
+and Cm of PROSPECT-D to all bands of the first file, from the same start within the same bounds: jaxlidar by
+the method of Levenberg and Marquardt in single precision with analytic derivatives, scipy by `least_squares`
+(trust region, finite differences, default tolerances) over `prosail.run_prospect`, leaf by leaf, with linear
+algebra on one thread (see `run.py`). Errors are differences from chemistry.
 
-FILE is an .npz of leaves as of the ANGERS database: `wavelength_nm`, `R` and `T` (leaves, wavelengths), of 1
-nm steps, and the chemistry `leaf_chltot_per_area`, `leaf_cartot_per_area` (ug/cm2), `leaf_water_thickness`
-(cm) and `leaf_mass_per_area` (g/cm2). Both fit N, Cab, Car, Cant, Cbrown, Cw and Cm of PROSPECT-D to all
-bands, from the same start within the same bounds: jaxlidar by the method of Levenberg and Marquardt in single
-precision with analytic derivatives, scipy by `least_squares` (trust region, finite differences, default
-tolerances) over `prosail.run_prospect`, leaf by leaf. Errors are differences from chemistry. The linear
-algebra of scipy has one thread: with two, on a busy machine, it took five times as long.
-
-For FILE, the files of `--also`, and synthetic leaves of PROSPECT with noise and a smooth model error: errors
-from all bands and from the recommended domains, and the fraction of leaves within two standard errors.
+For all files, and synthetic leaves of PROSPECT with noise and a smooth model error: errors from all bands and
+from the recommended domains, and the fraction of leaves within two standard errors.
 """
 
-import argparse
-import os
 from pathlib import Path
-
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import jax
 import numpy as np
-import prosail
-from _common import best, machine, plt, print_table, race, save_figure, write_json
-from scipy.optimize import least_squares
+from _common import best, new_figure, number, page_of, percent, race, table
 
 import jaxlidar as jl
 from inversion import invert_leaves
 
+TITLE = "Traits of measured leaves"
+QUICK = {"rounds": 1}
 CHEMISTRY = {
     "Cab": ("leaf_chltot_per_area", "µg/cm²"),
     "Car": ("leaf_cartot_per_area", "µg/cm²"),
@@ -49,6 +43,9 @@ PROSAIL_TRAITS = {
 
 def by_scipy(first: int, reflectance: np.ndarray, transmittance: np.ndarray) -> tuple[np.ndarray, int]:
     """Return traits (leaves, traits) and the number of evaluations; `first` is the first band of prosail."""
+    import prosail
+    from scipy.optimize import least_squares
+
     keys, start, low, high = (list(column) for column in zip(*PROSAIL_TRAITS.values()))
     bands, traits, calls = slice(first, first + reflectance.shape[1]), [], 0
 
@@ -100,25 +97,26 @@ def by_domain(record: dict[str, np.ndarray]) -> dict[str, dict[str, dict[str, fl
     return domains
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description="Inversion of PROSPECT on measured leaves.")
-    parser.add_argument("file", type=Path)
-    parser.add_argument("--also", nargs="*", default=[], type=Path, help="further files of leaves")
-    parser.add_argument("--out", default="figures", type=Path, help="folder of the results")
-    parser.add_argument("--rounds", default=3, type=int)
-    arguments = parser.parse_args()
-    with np.load(arguments.file) as archive:
-        record = dict(archive)
-    wavelength = record["wavelength_nm"]
-    R, T = record["R"].astype(float), record["T"].astype(float)
+def root_mean_square(errors: np.ndarray) -> float:
+    return float(np.sqrt(np.nanmean(errors**2)))
+
+
+def measure(files: tuple[str, ...] = (), rounds: int = 3) -> dict:
+    """Return the times and errors of both for the leaves of the first file, and our errors for all."""
+    if not files:
+        raise SystemExit("leaf_inversion needs files of leaves: --set files=FILE,FILE")
+    records = {}
+    for path in map(Path, files):
+        with np.load(path) as archive:
+            records[path.stem] = dict(archive)
+    leaves = next(iter(records.values()))
+    wavelength, R, T = leaves["wavelength_nm"], leaves["R"].astype(float), leaves["T"].astype(float)
     contestants = {
         "jaxlidar": lambda: invert_leaves(wavelength, R, T),
         "scipy": lambda: by_scipy(int(wavelength[0]) - 400, R, T),
     }
-    times = race(contestants, arguments.rounds)
+    times = race(contestants, rounds)
     per_leaf = {name: t / len(R) for name, t in best(times).items()}
-    ratio = per_leaf["scipy"] / per_leaf["jaxlidar"]
-    rounds = [scipy_traits / ours for scipy_traits, ours in zip(times["scipy"], times["jaxlidar"])]
 
     fit = contestants["jaxlidar"]()
     scipy_traits, calls = contestants["scipy"]()
@@ -126,58 +124,87 @@ def main() -> None:
         "jaxlidar": {name: np.asarray(value) for name, value in fit.traits.items()},
         "scipy": dict(zip(PROSAIL_TRAITS, scipy_traits.T)),
     }
-    truth = {name: record[column] for name, (column, _) in CHEMISTRY.items()}
-    rmse = {
-        who: {name: float(np.sqrt(np.nanmean((traits[name] - truth[name]) ** 2))) for name in truth}
-        for who, traits in estimates.items()
-    }
-    differences = {
-        name: float(np.max(np.abs(estimates["jaxlidar"][name] - estimates["scipy"][name]) / fit.stderr[name]))
-        for name in PROSAIL_TRAITS
-    }
-    domains = {"made by PROSPECT": by_domain(synthetic_leaves()), arguments.file.stem: by_domain(record)}
-    for path in arguments.also:
-        with np.load(path) as archive:
-            domains[path.stem] = by_domain(dict(archive))
-    write_json(
-        arguments.out / "leaf_inversion.json",
-        {
-            "machine": machine(),
-            "file": arguments.file.name,
-            "leaves": len(R),
-            "samples_per_leaf": 2 * wavelength.size,
-            "converged": int(np.sum(fit.converged)),
-            "seconds_per_leaf": per_leaf,
-            "times_faster": ratio,
-            "times_faster_each_round": rounds,
-            "evaluations_per_leaf": {
-                "jaxlidar, with Jacobian, all bands": float(np.mean(fit.n_steps)),
-                "scipy": calls / len(R),
-            },
-            "rmse": rmse,
-            "domains": domains,
-            "largest_difference_in_standard_errors": differences,
+    truth = {name: leaves[column] for name, (column, _) in CHEMISTRY.items()}
+    return {
+        "file": Path(files[0]).name,
+        "leaves": len(R),
+        "samples_per_leaf": 2 * wavelength.size,
+        "converged": int(np.sum(fit.converged)),
+        "seconds_per_leaf": per_leaf,
+        "times_faster": per_leaf["scipy"] / per_leaf["jaxlidar"],
+        "times_faster_each_round": [a / b for a, b in zip(times["scipy"], times["jaxlidar"])],
+        "evaluations_per_leaf": {
+            "jaxlidar, with Jacobian, all bands": float(np.mean(fit.n_steps)),
+            "scipy": calls / len(R),
         },
-    )
+        "rmse": {
+            who: {name: root_mean_square(traits[name] - truth[name]) for name in truth}
+            for who, traits in estimates.items()
+        },
+        "domains": {
+            "made by PROSPECT": by_domain(synthetic_leaves()),
+            **{name: by_domain(record) for name, record in records.items()},
+        },
+        "largest_difference_in_standard_errors": {
+            name: float(np.max(np.abs(estimates["jaxlidar"][name] - traits) / fit.stderr[name]))
+            for name, traits in estimates["scipy"].items()
+        },
+        "drawn": {"truth": truth, "estimates": estimates},
+    }
 
-    figure, axes = plt.subplots(2, 2, figsize=(7, 7), layout="constrained")
+
+def draw(record: dict):
+    """Draw estimates over measurements."""
+    truth, estimates = record["drawn"]["truth"], record["drawn"]["estimates"]
+    figure, axes = new_figure(2, (7, 7), 2)
     for ax, (name, (_, unit)) in zip(axes.flat, CHEMISTRY.items()):
         for who, marker in (("scipy", "+"), ("jaxlidar", ".")):
             ax.plot(truth[name], estimates[who][name], marker, linestyle="none", label=who)
         limit = 1.05 * np.nanmax([truth[name], estimates["jaxlidar"][name]])
         ax.plot([0, limit], [0, limit], color="black", linewidth=0.8)
-        ax.set(xlim=(0, limit), ylim=(0, limit), title=f"{name} ({unit}), rmse {rmse['jaxlidar'][name]:.3g}")
+        rmse = record["rmse"]["jaxlidar"][name]
+        ax.set(xlim=(0, limit), ylim=(0, limit), title=f"{name} ({unit}), rmse {rmse:.3g}")
         ax.set(xlabel="measured", ylabel="estimated", aspect="equal")
     # No leaf lies under the legend there.
     axes[1, 0].legend(loc="lower right")
-    figure.suptitle(f"{len(R)} measured leaves, PROSPECT-D: {ratio:.0f} times faster than scipy with prosail")
-    save_figure(figure, arguments.out / "leaf_inversion.png")
-
-    print_table(("rmse", *truth), [(who, *rmse[who].values()) for who in estimates])
-    print(f"ms a leaf: jaxlidar {1e3 * per_leaf['jaxlidar']:.3g}, scipy {1e3 * per_leaf['scipy']:.3g}")
-    print(f"{ratio:.0f} times faster (wanted: 50); round by round {', '.join(f'{r:.0f}' for r in rounds)}")
-    print(f"largest difference of traits: {max(differences.values()):.2g} standard errors")
+    figure.suptitle(
+        f"{record['leaves']} measured leaves, PROSPECT-D: {record['times_faster']:.0f} times faster than "
+        "scipy with prosail"
+    )
+    return figure
 
 
-if __name__ == "__main__":
-    main()
+def section(record: dict) -> str:
+    def error(name: str):
+        return lambda who: number(record["rmse"][who][name], 3)
+
+    def error_and_coverage(name: str):
+        return lambda r: f"{number(r['rmse'][name], 3)}, {percent(r['within two standard errors'][name])}"
+
+    domains = [
+        {"leaves": leaves, "domain": domain, **errors}
+        for leaves, by_bands in record["domains"].items()
+        for domain, errors in by_bands.items()
+    ]
+    return page_of(
+        f"{record['leaves']} measured leaves, all bands.",
+        table(
+            record["rmse"],
+            {
+                "": str,
+                "ms a leaf": lambda who: 1e3 * record["seconds_per_leaf"][who],
+                **{f"rms error of {name}": error(name) for name in CHEMISTRY},
+            },
+        ),
+        f"{number(record['times_faster'])} times faster than scipy over prosail.",
+        "Root mean square errors and fractions of leaves within two standard errors, by the bands that the "
+        "fit uses. Leaves made by PROSPECT have noise and a smooth error of the model.",
+        table(
+            domains,
+            {
+                "leaves": "leaves",
+                "domain": "domain",
+                **{name: error_and_coverage(name) for name in CHEMISTRY},
+            },
+        ),
+    )

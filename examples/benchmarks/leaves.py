@@ -1,7 +1,5 @@
 """Leaves that are hit or missed beside voxels: shots without a return, and what both cost.
 
-Run it as `python examples/benchmarks/leaves.py [--out figures] [--shots 1000]`.
-
 A RIEGL VZ-400 stands 1.5 m above the ground below ellipsoidal crowns in voxels of 0.5 m, and sends shots into
 three rings of zenith angles. The share of shots without a return is the gap probability of the crowns if
 leaves are hit or missed; voxels return the expected light of their leaves to nearly every shot. A hectare of
@@ -10,17 +8,17 @@ leaf area index 4 is a stand whose trees share the leaves of four individuals, s
 
 import dataclasses
 import itertools
-import resource
 import time
 import warnings
-from pathlib import Path
 
 import jax
 import numpy as np
-from _common import machine, new_figure, options, print_table, save_figure, write_json
+from _common import new_figure, number, page_of, peak_gigabytes, percent, table
 
 import jaxlidar as jl
 
+TITLE = "Leaves that are hit or missed"
+QUICK = {"shots": 20}
 RINGS = ((0.0, 30.0), (50.0, 65.0), (80.0, 90.0))
 SENSOR = np.array([20.0, 20.0, 1.5])
 LEAF, LEAF_AREA, RTOL = jl.LeafOptics(0.4, 0.35), 0.005, 0.3
@@ -119,11 +117,11 @@ def hectare(shots: int) -> tuple[list[dict], float]:
     ground = jl.Ground(reflectance=0.3)
     lidar = jl.Lidar(altitude=500.0, divergence=0.5, pulse=jl.GaussianPulse(fwhm=4.0))
     survey = jl.Survey(lidar, np.random.default_rng(0).uniform(10.0, 90.0, (shots, 2)))
-    rows, peak = [], 0.0
+    rows = []
     for rtol in (RTOL, 0.1):
         cost = simulate(survey, jl.Scene(meshes=meshes, ground=ground), rtol)[1]
         rows.append({"what": "hectare, leaves", "leaves": count, "rtol": rtol, "us per shot": cost})
-        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
+    peak = peak_gigabytes()
     voxels = dataclasses.replace(jl.voxelise(stand, 1.0), bark=None)
     scene = jl.Scene(canopy=jl.Canopy(voxels, leaf=LEAF), ground=ground)
     rows.append(
@@ -132,24 +130,19 @@ def hectare(shots: int) -> tuple[list[dict], float]:
     return rows, peak
 
 
-def main() -> None:
-    arguments = options("Leaves beside voxels.", shots=1000)
+def measure(shots: int = 1000) -> dict:
+    """Return the shares of `shots` in each ring without a return, and costs of shots."""
     with warnings.catch_warnings():
         # What it says of voxels is what this shows.
         warnings.filterwarnings("ignore", "(?s).*see crowns alone.*")
         warnings.simplefilter("ignore", jl.OffMapWarning)
         # First, as the peak of memory is that of the process.
-        hectare_costs, peak = hectare(arguments.shots // 2)
-        rows, costs = gaps(arguments.shots)
-    record = {"machine": machine(), "shots": arguments.shots, "rings": RINGS, "rows": rows, "peak GB": peak}
-    record["costs"] = costs + hectare_costs
-    write_json(arguments.out / "leaves.json", record)
-    draw(record, arguments.out)
-    print_table(("share of shots", *map(str, RINGS)), [(r["what"], *r["shares"]) for r in rows])
-    print_table(tuple(costs[0]), [tuple(c.values()) for c in record["costs"]])
+        hectare_costs, peak = hectare(shots // 2)
+        rows, costs = gaps(shots)
+    return {"shots": shots, "rings": RINGS, "rows": rows, "peak GB": peak, "costs": costs + hectare_costs}
 
 
-def draw(record: dict, out: Path) -> None:
+def draw(record: dict):
     """Draw the shares of shots without a return beside the gap probability."""
     figure, axes = new_figure()
     true, *others = record["rows"]
@@ -158,8 +151,28 @@ def draw(record: dict, out: Path) -> None:
     axes.plot([0, 1], [0, 1], color="0.6", lw=0.8, zorder=0)
     axes.set(xlabel="gap probability of the axes", ylabel="share of shots", xlim=(0.4, 1.0), ylim=(0.1, 1.0))
     axes.legend(fontsize="small", frameon=False)
-    save_figure(figure, out / "leaves.png")
+    return figure
 
 
-if __name__ == "__main__":
-    main()
+def section(record: dict) -> str:
+    shares = {
+        f"{low:g} to {high:g} degrees": lambda r, n=n: f"{r['shares'][n]:.3f}"
+        for n, (low, high) in enumerate(record["rings"])
+    }
+    costs = {
+        "scene": "what",
+        "leaves": "leaves",
+        "tolerance": lambda r: percent(r["rtol"]),
+        "µs a shot": "us per shot",
+    }
+    return page_of(
+        f"Shots of a VZ-400 that stands below crowns, {record['shots']:,} in each ring of zenith angles. A "
+        "voxel returns what is expected of its leaves, so that nearly every shot has a return from every "
+        "crown that it crosses; leaves of 50 cm2 are hit or missed. A beam has a width, and the edge of a "
+        "leaf returns a little of it.",
+        table(record["rows"], {"share of shots": "what", **shares}),
+        "CPU time of a shot. The hectare is a stand of 400 trees of leaf area index 4, seen from 500 m above "
+        "with footprints of 25 cm; with its leaves the process takes at most "
+        f"{number(record['peak GB'])} GB.",
+        table(record["costs"], costs),
+    )

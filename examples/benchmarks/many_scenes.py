@@ -1,21 +1,19 @@
 """Cost of a scene among many: stands of random density and ground reflectance, by `simulate_scenes`.
 
-Run it as `python examples/benchmarks/many_scenes.py [--out figures] [--scenes 10000]`. The stands and the
-lidar are those of the section on many scenes in `jaxlidar/README.md`. A tenth of the scenes is followed
-through eight orders, with several numbers of photons in each of eight batches. The error is that of the sum
-of a waveform, from the differences between two random keys.
+The stands and the lidar are those of the section on many scenes in `jaxlidar/README.md`. A tenth of the
+scenes is followed through eight orders, with several numbers of photons in each of eight batches. The error
+is that of the sum of a waveform, from the differences between two random keys.
 """
-
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from _common import machine, new_figure, options, print_table, save_figure, seconds, write_json
-from matplotlib.ticker import LogLocator, NullFormatter
+from _common import label_log_axis, new_figure, page_of, percent, seconds, table
 
 import jaxlidar as jl
 
+TITLE = "Cost of a scene among many"
+QUICK = {"scenes": 20}
 PHOTONS, MAX_ORDERS = (32, 128, 512), 8
 LIDAR = jl.Lidar(altitude=4e5, divergence=0.0625, aperture=0.8, pulse=jl.GaussianPulse(15.6))
 
@@ -50,36 +48,40 @@ def cost(scenes: jl.Scene, **settings) -> dict[str, object]:
     return {"scenes": count, "ms per scene": 1e3 * elapsed / count, "error": float(error)}
 
 
-def main() -> None:
-    arguments = options("Cost of many scenes.", scenes=10_000)
-    rows = [{"orders": 1, "photons": 0, **cost(stands(arguments.scenes), max_orders=1)}]
-    for photons in PHOTONS:
-        settings = {"max_orders": MAX_ORDERS, "n_photons": 8 * photons}
-        rows.append(
-            {
-                "orders": MAX_ORDERS,
-                "photons": 8 * photons,
-                **cost(stands(max(arguments.scenes // 10, 1)), **settings),
-            }
-        )
-    write_json(arguments.out / "many_scenes.json", {"machine": machine(), "rows": rows})
-    draw(rows, arguments.out)
-    print_table(tuple(rows[0]), [tuple(r.values()) for r in rows])
+def measure(scenes: int = 10_000) -> dict:
+    """Return the cost of a scene at first order, and with several numbers of photons."""
+    rows = [{"orders": 1, "photons": 0, **cost(stands(scenes), max_orders=1)}]
+    fewer = stands(max(scenes // 10, 1))
+    for photons in (8 * n for n in PHOTONS):
+        settings = {"max_orders": MAX_ORDERS, "n_photons": photons}
+        rows.append({"orders": MAX_ORDERS, "photons": photons, **cost(fewer, **settings)})
+    return {"rows": rows}
 
 
-def draw(rows: list[dict], out: Path) -> None:
+def draw(record: dict):
     """Draw the error of a scene by its time."""
     figure, axes = new_figure()
-    axes.loglog([r["ms per scene"] for r in rows[1:]], [100 * r["error"] for r in rows[1:]], "o-")
-    axes.axvline(rows[0]["ms per scene"], color="0.5", ls="--", label="first order")
+    first_order, *rows = record["rows"]
+    axes.loglog([r["ms per scene"] for r in rows], [100 * r["error"] for r in rows], "o-")
+    axes.axvline(first_order["ms per scene"], color="0.5", ls="--", label="first order")
     axes.set(xlabel="ms per scene", ylabel="error of the sum of a waveform, %", title="eight orders")
     axes.legend()
     for axis in (axes.xaxis, axes.yaxis):
-        axis.set(
-            major_locator=LogLocator(subs=(1, 3)), major_formatter="{x:g}", minor_formatter=NullFormatter()
-        )
-    save_figure(figure, out / "many_scenes.png")
+        label_log_axis(axis, 1, 3)
+    return figure
 
 
-if __name__ == "__main__":
-    main()
+def section(record: dict) -> str:
+    columns = {
+        "orders": "orders",
+        "photons a scene": "photons",
+        "scenes": "scenes",
+        "ms a scene": "ms per scene",
+        "error": lambda r: percent(r["error"]),
+    }
+    return page_of(
+        "Stands of 12 layers over level ground, of random density and ground reflectance, by `plan_scenes` "
+        "and `simulate_scenes`, compiled before. At first order nothing is random. The error is that of the "
+        "sum of a waveform, in the root mean square over scenes.",
+        table(record["rows"], columns),
+    )

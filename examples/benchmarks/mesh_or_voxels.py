@@ -1,8 +1,5 @@
 """How far voxel maps are from the triangles of the same tree, waveform by waveform.
 
-Run it as `python examples/benchmarks/mesh_or_voxels.py [--out figures] [--runs 4] [--photons 32768] [--edges
-4] [--footprints 4]`. Fewer runs, photons, edges of voxels (the largest alone) and footprints take less time.
-
 The tree is the paper's (Table 2), with and without leaves. As triangles it has leaves of random places and
 orientations in each clump. There are two kinds of voxel maps:
 
@@ -15,18 +12,21 @@ it does among triangles. Each simulation is repeated with independent keys, from
 What noise adds to the root mean square of a difference is subtracted.
 """
 
+import statistics
 import time
 from collections.abc import Iterator, Mapping
 from typing import Any, NamedTuple
 
 import jax
 import numpy as np
-from _common import machine, new_figure, options, print_table, save_figure, write_json
+from _common import new_figure, number, page_of, table
 from matplotlib.ticker import NullLocator
 
 import inversion
 import jaxlidar as jl
 
+TITLE = "Voxels against triangles"
+QUICK = {"runs": 2, "photons": 128, "n_edges": 1, "n_footprints": 1}
 ORDERS = 8
 EDGES = (1.0, 0.5, 0.25, 0.1)
 # Leaves of each clump, and their length, m: rhombuses of a quarter of its square.
@@ -205,6 +205,49 @@ def rounded(x: Any) -> Any:
     return float(f"{x:.5g}") if isinstance(x, float) else x
 
 
+def measure(runs: int = 4, photons: int = 32768, n_edges: int = 4, n_footprints: int = 4) -> dict:
+    """Return differences from the triangles, of independent runs; of voxels, the largest edges come first."""
+    tree = jl.grow(jl.broadleaf(), seed=0)
+    footprints = FOOTPRINTS[:n_footprints]
+    rows, sizes, waves, height = [], [], [], np.zeros(0)
+    key = jax.random.key(0)
+    for leaves, state in (("leaf-on", tree), ("leaf-off", tree.leafless())):
+        reference: list[Runs] = []
+        for kind, edge, seconds, scene in scenes(state, EDGES[:n_edges]):
+            names = {"leaves": leaves, "kind": kind, "edge": edge}
+            start, results = time.perf_counter(), []
+            for footprint in footprints:
+                # No two simulations share a key: their errors count as independent.
+                key, run_key = jax.random.split(key)
+                results.append(simulations(footprint, scene, run_key, runs, photons))
+            elapsed = time.perf_counter() - start
+            reference = reference or results
+            seconds = {"seconds to make": seconds, "seconds to simulate": elapsed}
+            sizes.append({**names, "size": scene_size(scene), **seconds})
+            height = results[0].height
+            if (kind, edge) in DRAWN:
+                mean = results[0].waves["all orders"].mean(axis=0)
+                waves.append({**names, "reflectance": mean.tolist()})
+            for footprint, result, truth in zip(footprints, results, reference):
+                if kind != TRIANGLES:
+                    comparisons = [compare(result, truth, orders) for orders in ("first order", "all orders")]
+                    rows += [{**names, **footprint._asdict(), **c} for c in comparisons]
+    return rounded(
+        {
+            "runs": runs,
+            "photons": photons,
+            "orders": ORDERS,
+            "clumps": len(tree.bud_position),
+            "leaf area of a clump": LEAF_AREA,
+            "steepness factor of wood": steepness_factor(tree),
+            "scenes": sizes,
+            "rows": rows,
+            "height": height.tolist(),
+            "waves": waves,
+        }
+    )
+
+
 def draw(record: Mapping[str, Any]) -> Any:
     """Draw waveforms of the first footprint, and differences by the edge of voxels."""
     figure, axes = new_figure(2, (10.0, 5.6), rows=2)
@@ -254,55 +297,76 @@ def draw_differences(axes: Any, rows: list[dict]) -> None:
     axes.xaxis.set_minor_locator(NullLocator())
 
 
-def main() -> None:
-    counts = {"runs": 4, "photons": 32768, "edges": len(EDGES), "footprints": len(FOOTPRINTS)}
-    choices = options("Voxel maps against triangles.", **counts)
-    tree = jl.grow(jl.broadleaf(), seed=0)
-    footprints = FOOTPRINTS[: choices.footprints]
-    rows, sizes, waves, height = [], [], [], np.zeros(0)
-    key = jax.random.key(0)
-    for leaves, state in (("leaf-on", tree), ("leaf-off", tree.leafless())):
-        reference: list[Runs] = []
-        for kind, edge, seconds, scene in scenes(state, EDGES[: choices.edges]):
-            names = {"leaves": leaves, "kind": kind, "edge": edge}
-            start, results = time.perf_counter(), []
-            for footprint in footprints:
-                # No two simulations share a key: their errors count as independent.
-                key, run_key = jax.random.split(key)
-                results.append(simulations(footprint, scene, run_key, choices.runs, choices.photons))
-            elapsed = time.perf_counter() - start
-            reference = reference or results
-            size = scene_size(scene)
-            seconds = {"seconds to make": seconds, "seconds to simulate": elapsed}
-            sizes.append({**names, "size": size, **seconds})
-            height = results[0].height
-            if (kind, edge) in DRAWN:
-                mean = results[0].waves["all orders"].mean(axis=0)
-                waves.append({**names, "reflectance": mean.tolist()})
-            for footprint, result, truth in zip(footprints, results, reference):
-                if kind != TRIANGLES:
-                    comparisons = [compare(result, truth, orders) for orders in ("first order", "all orders")]
-                    rows += [{**names, **footprint._asdict(), **c} for c in comparisons]
-    record = rounded(
-        {
-            "machine": machine(),
-            "runs": choices.runs,
-            "photons": choices.photons,
-            "orders": ORDERS,
-            "clumps": len(tree.bud_position),
-            "leaf area of a clump": LEAF_AREA,
-            "steepness factor of wood": steepness_factor(tree),
-            "scenes": sizes,
-            "rows": rows,
-            "height": height.tolist(),
-            "waves": waves,
-        }
+def waveform_difference(rows: list[dict]) -> str:
+    """Return the mean over footprints of the rms difference in percent, or the noise if that is larger."""
+    rms, noise = (100 * statistics.fmean(row[name] for row in rows) for name in ("rms", "rms of noise"))
+    return f"{rms:.1f}" if rms > noise else f"< {noise:.1f}"
+
+
+def difference(rows: list[dict], measure: str, relative: bool = False) -> str:
+    """Return the mean difference over footprints with its standard error, in percent if relative."""
+    reference = statistics.fmean(row["reference"][measure] for row in rows)
+    if reference == 0.0:
+        return ""
+    factor, digits = (100.0 / reference, 1) if relative else (1.0, 3)
+    value = factor * statistics.fmean(row["differences"][measure] for row in rows)
+    error = abs(factor) * sum(row["errors"][measure] ** 2 for row in rows) ** 0.5 / len(rows)
+    return f"{value:+.{digits}f} ± {error:.{digits}f}"
+
+
+def section(record: dict) -> str:
+    scenes = [s for s in record["scenes"] if s["kind"] != TRIANGLES]
+    diameters = sorted({row["diameter"] for row in record["rows"]})
+    narrow = diameters[0]
+
+    def rows_of(scene: dict, orders: str = "all orders", diameter: float = narrow) -> list[dict]:
+        chosen = {key: scene[key] for key in ("leaves", "kind", "edge")}
+        chosen |= {"orders": orders, "diameter": diameter}
+        return [row for row in record["rows"] if all(row[key] == value for key, value in chosen.items())]
+
+    def noise(scene: dict) -> str:
+        return f"{100 * statistics.fmean(row['rms of noise'] for row in rows_of(scene)):.1f}"
+
+    scene_columns = {
+        "leaves": "leaves",
+        "scene": lambda s: f"{s['edge']:g} m, {s['kind']}" if s["edge"] else s["kind"],
+    }
+    waves = {
+        f"{d:g} m, {orders}: %": lambda s, d=d, orders=orders: waveform_difference(rows_of(s, orders, d))
+        for d in diameters
+        for orders in ("first order", "all orders")
+    }
+    percents = {
+        f"{m}: %": lambda s, m=m: difference(rows_of(s), m, relative=True)
+        for m in ("total", "leaf", "wood", "ground")
+    }
+    heights = {f"{m}: m": lambda s, m=m: difference(rows_of(s), m) for m in ("RH50", "RH98")}
+    triangles, *_ = record["scenes"]
+    finest = min((s for s in scenes if s["kind"] == "by area"), key=lambda s: s["edge"])
+    shots = record["runs"] * len({(row["diameter"], tuple(row["place"])) for row in record["rows"]})
+    return page_of(
+        f"The paper's tree over ground at 1064 nm, as {triangles['size']:,} triangles and as voxels, seen by "
+        f"footprints of {' and '.join(f'{d:g}' for d in diameters)} m with a pulse of 6 ns, "
+        f"{record['orders']} orders.",
+        '"By area": `voxelise(tree, edge, leaf_area=, wood="surface")` has the leaf area of the triangles '
+        'and attenuates by a quarter of the surface of wood. "By volume": the default of `voxelise`, the '
+        "paper's probability map, has the fractions of voxels that clumps and wood fill; its leaf area "
+        'follows from the edge. "Other leaves": triangles whose leaves have other random places within the '
+        "same clumps, which is as near as a map can come.",
+        "Leaf optics, wood, ground and lidar are the same. In voxels, too, light of the first order returns "
+        "through the gap by which it came (`hotspot=True`, the default; the paper has none). Light of higher "
+        "orders meets the gaps among triangles again, but in voxels it is attenuated independently.",
+        "Root mean square difference of waveforms from those of the triangles, over samples above 1 % of the "
+        "peak, in percent of the root mean square there; mean over footprints. What the noise of the "
+        "simulations adds is subtracted.",
+        table(scenes, {**scene_columns, **waves, f"{narrow:g} m, noise: %": noise}),
+        f"Differences of the footprints of {narrow:g} m, all orders, with standard errors of the "
+        "simulations: of the apparent reflectance in all and of each material, and of relative heights.",
+        table(scenes, {**scene_columns, **percents, **heights}),
+        "What remains by area at 0.1 m without leaves is scattering, not attenuation: facets of wood in "
+        "voxels have all orientations, branches are steep. By their normals alone, wood seen from above "
+        f"returns {100 * (record['steepness factor of wood'] - 1):.0f} % more in voxels than as triangles.",
+        f"{shots} simulations of {record['photons']:,} photons, compilation included, take "
+        f"{number(triangles['seconds to simulate'])} s with triangles and "
+        f"{number(finest['seconds to simulate'])} s with {finest['size']:,} voxels of {finest['edge']:g} m.",
     )
-    write_json(choices.out / "mesh_or_voxels.json", record)
-    save_figure(draw(record), choices.out / "mesh_or_voxels.png")
-    names = ("leaves", "kind", "edge", "diameter", "orders", "rms")
-    print_table(names, [tuple(row[name] for name in names) for row in rows])
-
-
-if __name__ == "__main__":
-    main()

@@ -1,26 +1,25 @@
 """Cost of meshes: the crown benchmark with 1,000 triangles, and with a million of 100 instances.
 
-Run it as `python examples/benchmarks/meshes.py [--out figures] [--photons 32768] [--rounds 3]`. The scene is
-a crown of voxels over the ground, four orders, of light of one wavelength. Beside it stand trunks of
-triangles: none, one of 1,000 triangles, or 100 instances of a mesh of 10,000. Alone: the same without voxels.
+The scene is a crown of voxels over the ground, four orders, of light of one wavelength. Beside it stand
+trunks of triangles: none, one of 1,000 triangles, or 100 instances of a mesh of 10,000. Alone: the same
+without voxels.
 """
 
 import jax
 import numpy as np
-from _common import best, machine, new_figure, options, print_table, race, save_figure, seconds, write_json
+from _common import best, crown_extinction, new_figure, page_of, race, seconds, table
 
 import jaxlidar as jl
 
+TITLE = "Cost of meshes"
+QUICK = {"photons": 1024, "rounds": 1}
 ORDERS = 4
 N, SIZE = 32, 10.0
 
 
 def crown() -> jl.Canopy:
     """Return leaf and bark in a sphere of voxels."""
-    centres = (np.arange(N) + 0.5) * SIZE / N
-    x, y, z = np.meshgrid(centres, centres, centres, indexing="ij")
-    inside = (x - 5) ** 2 + (y - 5) ** 2 + (z - 6) ** 2 < 3.5**2
-    k = np.where(inside, 0.5 * np.random.default_rng(0).uniform(0, 2, (N, N, N)), 0.0)
+    k = crown_extinction(N)
     voxels = jl.VoxelMap.from_extinction(0.9 * k, 0.1 * k, voxel_size=SIZE / N, origin=(-5.0, -5.0, 0.0))
     return jl.Canopy(voxels, leaf=jl.LeafOptics(0.45, 0.4), bark=0.4)
 
@@ -50,49 +49,58 @@ def meshes() -> dict[str, tuple[jl.MeshSurface, ...]]:
     }
 
 
-def main() -> None:
-    arguments = options("Cost of meshes.", photons=32768, rounds=3)
+def measure(photons: int = 32768, rounds: int = 3) -> dict:
+    """Return the times of all scenes, which trace the same photons."""
     lidar, key = jl.Lidar(divergence=10.0, profile="top-hat"), jax.random.key(0)
     canopy, ground = crown(), jl.Ground(reflectance=0.3)
     scenes = {name: jl.Scene(canopy=canopy, ground=ground, meshes=m) for name, m in meshes().items()}
     scenes["1,000 triangles alone"] = jl.Scene(ground=ground, meshes=meshes()["1,000 triangles"])
-    # A tolerance that eight batches meet: all scenes trace the same photons.
-    choices = {"n_photons": arguments.photons, "max_orders": ORDERS}
+    # A tolerance that eight batches meet.
+    choices = {"n_photons": photons, "max_orders": ORDERS}
     plans = {name: jl.plan(lidar, scene, rtol=0.9, **choices) for name, scene in scenes.items()}
 
     def simulation(name):
-        def run():
-            return jl.simulate(lidar, scenes[name], key=key, rtol=0.9, plan=plans[name]).reflectance
-
-        return run
+        return lambda: jl.simulate(lidar, scenes[name], key=key, rtol=0.9, plan=plans[name]).reflectance
 
     contestants = {name: simulation(name) for name in scenes}
     first_calls = {name: seconds(run) for name, run in contestants.items()}
-    times = best(race(contestants, arguments.rounds))
-    ratio = {name: t / times["voxels alone"] for name, t in times.items()}
-    record = {
-        "machine": machine(),
-        "photons": arguments.photons,
+    times = best(race(contestants, rounds))
+    return {
+        "photons": photons,
         "orders": ORDERS,
         "triangles": {n: sum(m.n_triangles * len(m.instances) for m in s.meshes) for n, s in scenes.items()},
         "seconds": times,
         "seconds_first_call": first_calls,
-        "times_voxels_alone": ratio,
+        "times_voxels_alone": {name: t / times["voxels alone"] for name, t in times.items()},
         "memory_bytes": {name: plan.memory for name, plan in plans.items()},
     }
-    write_json(arguments.out / "meshes.json", record)
 
+
+def draw(record: dict):
+    """Draw the seconds of each scene."""
     figure, axes = new_figure(size=(7, 3))
+    times = record["seconds"]
     axes.barh(list(times), list(times.values()))
     axes.invert_yaxis()
     axes.axvline(1.5 * times["voxels alone"], color="black", linestyle="--", label="1.5 times voxels alone")
     axes.axvline(10 * times["voxels alone"], color="grey", linestyle=":", label="10 times voxels alone")
-    axes.set(xlabel="seconds", title=f"simulate: {arguments.photons} photons, {ORDERS} orders")
+    axes.set(xlabel="seconds", title=f"simulate: {record['photons']} photons, {ORDERS} orders")
     axes.legend()
-    save_figure(figure, arguments.out / "meshes.png")
-    rows = [(n, t, ratio[n], first_calls[n], 1e-6 * plans[n].memory) for n, t in times.items()]
-    print_table(("scene", "s", "times voxels alone", "s, first call", "MB"), rows)
+    return figure
 
 
-if __name__ == "__main__":
-    main()
+def section(record: dict) -> str:
+    columns = {
+        "scene": str,
+        "triangles": record["triangles"],
+        "s": record["seconds"],
+        "times voxels alone": record["times_voxels_alone"],
+        "s, first call": record["seconds_first_call"],
+        "MB, predicted": lambda name: 1e-6 * record["memory_bytes"][name],
+    }
+    return page_of(
+        f"Seconds of `simulate` with {record['photons']:,} photons and {record['orders']} orders: a crown "
+        "of 32³ voxels over the ground, and trunks of triangles beside and within it. A copy of a mesh costs "
+        "its transformation alone.",
+        table(record["seconds"], columns),
+    )

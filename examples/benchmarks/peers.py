@@ -1,9 +1,8 @@
 """jaxlidar beside Mitsuba 3 with mitransient, and MCX-CL: seconds until a waveform is known to 1 %.
 
-Run it as `python examples/benchmarks/peers.py [--out figures] [--repeats 8]` after `pip install -e
-'.[bench]'`, which brings the peers where they run on a CPU. A missing peer is left out, with a note. Each
-runs in a process of its own. mitransient needs an LLVM library (`DRJIT_LIBLLVM_PATH`, or the one that the
-extra brings), pmcxcl an OpenCL runtime (see `_peer_mcx.py`).
+`pip install -e '.[bench]'` brings the peers where they run on a CPU. A missing peer is left out, with a
+note. Each runs in a process of its own. mitransient needs an LLVM library (`DRJIT_LIBLLVM_PATH`, or the one
+that the extra brings), pmcxcl an OpenCL runtime (see `_peer_mcx.py`).
 
 The scene: 64^3 voxels of 10 m / 64; in a sphere of radius 3.5 m the extinction is 0.5 U(0, 2) 1/m, rounded to
 1/200 1/m because MCX numbers its media; isotropic scattering with albedo 0.9; Lambertian ground of
@@ -36,19 +35,17 @@ angle of 10 degrees, from the rate of photons and the Poisson statistics of equa
 """
 
 import os
-import subprocess
-import sys
-import tempfile
-import time
-from pathlib import Path
 
 import jax
 import numpy as np
-from _common import machine, new_figure, options, print_table, save_figure, write_json
+from _common import new_figure, number, page_of, table
+from _peer import repeated, run_peer
 from simulation_cost import LIDAR, ORDERS, SIZE, WINDOW, N, scenes
 
 import jaxlidar as jl
 
+TITLE = "Other codes"
+QUICK = {"repeats": 3, "rtol": 0.2, "work": 0.01}
 FINE, SAMPLES, LEVELS = 0.05, 200, 200
 ALBEDO, SOIL = 0.9, 0.3
 PULSES = {"instant": 0.0, "6 ns": 6.0}
@@ -72,16 +69,19 @@ def crown_extinction() -> np.ndarray:
     return np.rint(k * LEVELS) / LEVELS
 
 
-def worker_task(extinction: np.ndarray, repeats: int) -> dict:
-    """Return the arrays that a worker reads."""
+def worker_task(extinction: np.ndarray, repeats: int, work: float = 1.0) -> dict:
+    """Return the arrays that a worker reads; `work` is a factor of the number of rays and photons."""
     return {
         **{"extinction": extinction, "albedo": ALBEDO, "reflectance": SOIL, "orders": ORDERS, "size": SIZE},
         **{"altitude": float(LIDAR.altitude), "radius": float(LIDAR.footprint_radius), "fine": FINE},
-        **{"start": WINDOW[0] - 0.5, "count": round(SAMPLES / FINE), "repeats": repeats, **WORK},
+        **{"start": WINDOW[0] - 0.5, "count": round(SAMPLES / FINE), "repeats": repeats},
+        **{name: round(work * amount) for name, amount in WORK.items()},
     }
 
 
-def run_jaxlidar(extinction: np.ndarray, case: str, pulse: float, repeats: int, orders: int = ORDERS) -> dict:
+def run_jaxlidar(
+    extinction: np.ndarray, case: str, pulse: float, repeats: int, orders: int = ORDERS, rtol: float = 0.01
+) -> dict:
     """Return waveforms and times of the crown of a case."""
     voxels = jl.VoxelMap.from_extinction(
         leaf=extinction, voxel_size=SIZE / N, origin=(-SIZE / 2, -SIZE / 2, 0.0)
@@ -92,40 +92,27 @@ def run_jaxlidar(extinction: np.ndarray, case: str, pulse: float, repeats: int, 
     lidar = jl.Lidar(
         divergence=LIDAR.divergence, profile="top-hat", pulse=jl.GaussianPulse(pulse), **receiver
     )
-    return repeat_jaxlidar(lidar, scene, repeats, orders)
+    return repeat_jaxlidar(lidar, scene, repeats, orders, rtol)
 
 
-def repeat_jaxlidar(lidar: jl.Lidar, scene: jl.Scene, repeats: int, orders: int) -> dict:
-    """Return waveforms and times of repetitions of `simulate` to 1 %, and the time of the first call."""
-    waves, times, infos = [], [], []
-    for seed in range(repeats + 1):
-        start, work = time.perf_counter(), time.process_time()
+def repeat_jaxlidar(lidar: jl.Lidar, scene: jl.Scene, repeats: int, orders: int, rtol: float = 0.01) -> dict:
+    """Return waveforms and times of repetitions of `simulate`, and the time of the first call."""
+
+    def simulate(seed: int) -> tuple[np.ndarray, jl.Waveform]:
         key = jax.random.key(seed)
-        wave = jl.simulate(lidar, scene, key=key, rtol=0.01, max_orders=orders, window=WINDOW)
-        waves.append(np.asarray(wave.reflectance[0], dtype=float))
-        times.append((time.perf_counter() - start, time.process_time() - work))
-        infos.append(wave.info)
+        wave = jl.simulate(lidar, scene, key=key, rtol=rtol, max_orders=orders, window=WINDOW)
+        return np.asarray(wave.reflectance[0], dtype=float), wave
+
+    results, times, first = repeated(simulate, repeats)
+    samples, waves = zip(*results)
     return {
-        "waves": np.array(waves[1:]),
-        "times": np.array(times[1:]),
-        "first": times[0][0],
-        "own_error": float(np.mean([i["error"] for i in infos[1:]])),
-        "photons": float(np.mean([i["photons"] for i in infos[1:]])),
-        "neglected": float(wave.neglected[0]),
+        "waves": np.array(samples),
+        "times": times,
+        "first": first,
+        "own_error": float(np.mean([wave.info["error"] for wave in waves])),
+        "photons": float(np.mean([wave.info["photons"] for wave in waves])),
+        "neglected": float(waves[-1].neglected[0]),
     }
-
-
-def run_peer(worker: str, task_file: Path) -> dict[str, np.ndarray] | str:
-    """Run a worker and return its arrays, or the reason of its failure."""
-    with tempfile.TemporaryDirectory() as folder:
-        result = Path(folder, "result.npz")
-        command = [sys.executable, str(Path(__file__).with_name(worker)), str(task_file), str(result)]
-        process = subprocess.run(command, capture_output=True, text=True, errors="replace")
-        if not result.exists():
-            lines = (process.stderr.strip() or process.stdout.strip() or "no message").splitlines()
-            reason = next((line for line in lines if line.startswith("error:")), "")
-            return "; ".join(filter(None, (lines[-1], reason, f"exit status {process.returncode}")))
-        return dict(np.load(result))
 
 
 def sampled(fine: np.ndarray, pulse: float) -> np.ndarray:
@@ -196,98 +183,63 @@ def agreement(a: np.ndarray, b: np.ndarray) -> dict[str, float]:
     }
 
 
-def main() -> None:
-    arguments = options("jaxlidar beside peers.", repeats=8)
-    if arguments.repeats < 3:
-        raise SystemExit(f"--repeats = {arguments.repeats} is below 3: no standard deviation to speak of")
+def measured_by_all(repeats: int, rtol: float, work: float) -> tuple[dict, dict, dict]:
+    """Return runs by case and pulse and by code, notes on the peers, and the load before each."""
     extinction = crown_extinction()
-
-    runs: dict[tuple[str, str], dict[str, dict]] = {}
     load = {"jaxlidar": os.getloadavg()[0]}
-    for case in CASES:
-        for pulse, fwhm in PULSES.items():
-            runs[case, pulse] = {"jaxlidar": run_jaxlidar(extinction, case, fwhm, arguments.repeats)}
+    runs = {
+        (case, pulse): {"jaxlidar": run_jaxlidar(extinction, case, fwhm, repeats, rtol=rtol)}
+        for case in CASES
+        for pulse, fwhm in PULSES.items()
+    }
     notes: dict[str, str] = {}
-    with tempfile.TemporaryDirectory() as folder:
-        file = Path(folder, "given.npz")
-        np.savez(file, **worker_task(extinction, arguments.repeats))
-        for name, worker in (("mitransient", "_peer_mitransient.py"), ("MCX-CL", "_peer_mcx.py")):
-            load[name] = os.getloadavg()[0]
-            measurements = run_peer(worker, file)
-            if isinstance(measurements, str):
-                notes[name] = f"left out: {measurements}"
-                continue
-            notes[name] = str(measurements["version"])
-            if not measurements.get("corrected", True):
-                notes[name] += ", path lengths not corrected: only totals are comparable"
-            for (case, pulse), run in runs.items():
-                if f"{case}_waves" in measurements:
-                    waves = sampled(measurements[f"{case}_waves"], PULSES[pulse])
-                    times, first = measurements[f"{case}_times"], float(measurements[f"{case}_first"])
-                    run[name] = {"waves": waves, "times": times, "first": first}
+    for name, worker in (("mitransient", "_peer_mitransient.py"), ("MCX-CL", "_peer_mcx.py")):
+        load[name] = os.getloadavg()[0]
+        measurements = run_peer(worker, worker_task(extinction, repeats, work))
+        if isinstance(measurements, str):
+            notes[name] = f"left out: {measurements}"
+            continue
+        notes[name] = str(measurements["version"])
+        if not measurements.get("corrected", True):
+            notes[name] += ", path lengths not corrected: only totals are comparable"
+        for (case, pulse), run in runs.items():
+            if f"{case}_waves" in measurements:
+                waves = sampled(measurements[f"{case}_waves"], PULSES[pulse])
+                times, first = measurements[f"{case}_times"], float(measurements[f"{case}_first"])
+                run[name] = {"waves": waves, "times": times, "first": first}
+    return runs, notes, load
 
-    results, rows = [], []
+
+def measure(repeats: int = 8, rtol: float = 0.01, work: float = 1.0) -> dict:
+    """Return the costs of all codes; `rtol` is that of jaxlidar, `work` a factor of that of the peers."""
+    if repeats < 3:
+        raise SystemExit(f"repeats={repeats} is below 3: no standard deviation to speak of")
+    runs, notes, load = measured_by_all(repeats, rtol, work)
+    results = []
     for (case, pulse), run in runs.items():
-        jaxlidar_cost = cost_of(run["jaxlidar"])
+        ours = cost_of(run["jaxlidar"])
         for name, code_run in run.items():
             cost = cost_of(code_run)
             if name != "jaxlidar":
-                cost["ratio"] = cost["seconds_to_1_percent"] / jaxlidar_cost["seconds_to_1_percent"]
-                cost["cpu_ratio"] = (
-                    cost["cpu_seconds_to_1_percent"] / jaxlidar_cost["cpu_seconds_to_1_percent"]
-                )
+                cost["ratio"] = cost["seconds_to_1_percent"] / ours["seconds_to_1_percent"]
+                cost["cpu_ratio"] = cost["cpu_seconds_to_1_percent"] / ours["cpu_seconds_to_1_percent"]
             if name != "jaxlidar" and case != "camera":
                 cost["agreement"] = agreement(run["jaxlidar"]["waves"], code_run["waves"])
             if name == "MCX-CL":
-                cost["seconds_if_counted_computed"] = seconds_if_counted(code_run, WORK["mcx_photons"])
+                counted = seconds_if_counted(code_run, round(work * WORK["mcx_photons"]))
+                cost["seconds_if_counted_computed"] = counted
                 notes["counted"] = notes.get("counted", "MCX-CL counting photons, computed s to 1 %") + (
-                    f"; {pulse} {cost['seconds_if_counted_computed']:.3g}"
+                    f"; {pulse} {counted:.3g}"
                 )
             results.append({"case": CASES[case], "pulse": pulse, "code": name, **cost})
-            test = cost.get("agreement")
-            rows.append(
-                (
-                    f"{CASES[case]}, {pulse}: {name}",
-                    cost["seconds"],
-                    100 * cost["error"],
-                    cost["seconds_to_1_percent"],
-                    cost["cpu_seconds_to_1_percent"],
-                    cost.get("ratio", ""),
-                    cost.get("cpu_ratio", ""),
-                    cost["first_call_seconds"],
-                    cost["total"],
-                    f"{test['total_z']:.1f}, {test['rms_z']:.2f} ({test['rms_z_expected']:.2f})"
-                    if test
-                    else "",
-                )
-            )
-    record = {"machine": {**machine(), "load_before": load}, "notes": notes}
-    write_json(arguments.out / "peers.json", {**record, "work": WORK, "results": results})
-    draw_record(runs, results, arguments.out / "peers.png")
-    head = (
-        "",
-        "s",
-        "error %",
-        "s to 1 %",
-        "CPU s",
-        "ratio",
-        "CPU ratio",
-        "s, first",
-        "total",
-        "z: total, rms",
-    )
-    print_table(head, rows)
-    print("ratio: of the seconds to 1 % to jaxlidar's")
-    print("load before:", ", ".join(f"{name} {value:.1f}" for name, value in load.items()))
-    for name, note in notes.items():
-        print(f"{name}: {note}")
+    return {"load_before": load, "notes": notes, "work": WORK, "results": results, "drawn": runs}
 
 
-def draw_record(runs: dict, results: list[dict], path: Path) -> None:
+def draw(record: dict):
     """Draw waveforms with bands of two standard deviations of one repetition, and the time to 1 %."""
     figure, grid = new_figure(2, (11, 7.5), rows=2)
-    axes = grid.flat
-    names = list(dict.fromkeys(r["code"] for r in results))
+    axes, runs = grid.flat, record["drawn"]
+    names = list(dict.fromkeys(r["code"] for r in record["results"]))
     colour = {name: f"C{i}" for i, name in enumerate(names)}
     style = dict(zip(names, ("-", "--", "-.", ":")))
     at = WINDOW[0] + np.arange(SAMPLES)
@@ -305,7 +257,7 @@ def draw_record(runs: dict, results: list[dict], path: Path) -> None:
         ax.set_ylabel("apparent reflectance per ns")
     keys = {(CASES[case], pulse): n for n, (case, pulse) in enumerate(runs)}
     for name in names:
-        code_results = [r for r in results if r["code"] == name]
+        code_results = [r for r in record["results"] if r["code"] == name]
         y = [keys[r["case"], r["pulse"]] for r in code_results]
         for marker, quantity, label in (("o", "seconds", name), ("x", "cpu_seconds", None)):
             values = [r[f"{quantity}_to_1_percent"] for r in code_results]
@@ -313,8 +265,25 @@ def draw_record(runs: dict, results: list[dict], path: Path) -> None:
     axes[3].set_yticks(list(keys.values()), [", ".join(key) for key in keys], fontsize=8)
     axes[3].invert_yaxis()
     axes[3].set(xlabel="seconds to 1 %: wall (o), CPU (x)", title="what 1 % costs")
-    save_figure(figure, path)
+    return figure
 
 
-if __name__ == "__main__":
-    main()
+def section(record: dict) -> str:
+    columns = {
+        "scene, pulse": lambda r: f"{r['case']}, {r['pulse']}",
+        "code": "code",
+        "s to 1 %": "seconds_to_1_percent",
+        "CPU s to 1 %": "cpu_seconds_to_1_percent",
+        "times jaxlidar": lambda r: r.get("ratio"),
+        "s, first call": "first_call_seconds",
+        "total": lambda r: number(r["total"], 4),
+    }
+    return page_of(
+        "Seconds to a waveform with an error of 1 %, for jaxlidar and codes that compute the same: a crown "
+        "of 64³ voxels with 15 scatterings, seen by a receiver as wide as the illuminated area, or by one "
+        "that sees everything. The other codes have features that jaxlidar lacks (any material and camera, "
+        "polarisation); they do not serve all wavelengths by one trace, and do not stop at a tolerance. A "
+        "scene of triangles is compared in the same way on the "
+        "[page of validation](../validation/README.md#mitransient-meshes).",
+        table(record["results"], columns),
+    )

@@ -1,7 +1,7 @@
 """A gradient in every voxel, jaxlidar beside Mitsuba's `prbvolpath`: seconds by its error.
 
-Run it as `python examples/benchmarks/peers_gradient.py [--out figures] [--repeats 8]` after `pip install -e
-'.[bench]'`. Mitsuba runs in a process of its own, after jaxlidar; the load before each is recorded.
+Mitsuba, which `pip install -e '.[bench]'` brings, runs in a process of its own, after jaxlidar; the load
+before each is recorded.
 
 The scene is the crown of `peers.py` alone, 64^3 voxels and up to 15 scatterings, from 20 km, so that the
 range of returns does not matter. Over ground, light that leaves the crown sideways and comes back from far
@@ -18,27 +18,25 @@ errors of the difference.
 """
 
 import os
-import tempfile
-import time
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from _common import machine, new_figure, options, print_table, save_figure, write_json
-from peers import ALBEDO, crown_extinction, run_peer
+from _common import new_figure, number, page_of, percent, table
+from _peer import repeated_gradient, run_peer
+from peers import ALBEDO, crown_extinction
 from simulation_cost import LIDAR, ORDERS, SIZE, N
 
 import jaxlidar as jl
 
+TITLE = "A gradient beside another code"
+QUICK = {"repeats": 3, "photons": 8 * 64, "samples": 2**10}
 ALTITUDE, GOAL = 20_000.0, 0.1
 RADIUS = float(LIDAR.footprint_radius)
-# Photons of one gradient, of all eight batches of jaxlidar, and samples of Mitsuba.
-PHOTONS, SAMPLES = 8 * 8192, 2**19
 WINDOW = (-90.0, 109.0)
 
 
-def run_jaxlidar(extinction: np.ndarray, repeats: int) -> dict:
+def run_jaxlidar(extinction: np.ndarray, repeats: int, photons: int) -> dict:
     """Return totals, gradients and times of repetitions with other random numbers."""
     lidar = jl.Lidar(
         altitude=ALTITUDE,
@@ -53,23 +51,18 @@ def run_jaxlidar(extinction: np.ndarray, repeats: int) -> dict:
         canopy = jl.Canopy(voxels, leaf=jl.Isotropic(albedo=ALBEDO), hotspot=False)
         return jl.Scene(canopy=canopy)
 
-    plan = jl.plan(lidar, scene(extinction), max_orders=ORDERS, n_photons=PHOTONS, window=WINDOW)
+    plan = jl.plan(lidar, scene(extinction), max_orders=ORDERS, n_photons=photons, window=WINDOW)
 
     def total(k, key):
         return jnp.sum(jl.simulate(lidar, scene(k), plan=plan, key=key).reflectance)
 
-    out: dict = {}
-    k = jnp.asarray(extinction, float)
-    for name, function in (("simulation", jax.jit(total)), ("gradient", jax.jit(jax.value_and_grad(total)))):
-        results, times = [], []
-        for seed in range(repeats + 1):
-            wall, cpu = time.perf_counter(), time.process_time()
-            results.append(jax.block_until_ready(function(k, jax.random.key(seed))))
-            times.append((time.perf_counter() - wall, time.process_time() - cpu))
-        out[f"{name}_times"], out[f"{name}_first"] = np.array(times[1:]), times[0][0]
-    out["totals"] = np.array([value for value, _ in results[1:]])
-    out["gradients"] = np.array([np.asarray(slopes) for _, slopes in results[1:]])
-    return out
+    k, slopes = jnp.asarray(extinction, float), jax.value_and_grad(total)
+
+    def call(function):
+        function = jax.jit(function)
+        return lambda seed: jax.block_until_ready(function(k, jax.random.key(seed)))
+
+    return repeated_gradient(call(total), call(slopes), repeats)
 
 
 def cost_of(run: dict, extinction: np.ndarray) -> dict[str, float]:
@@ -103,42 +96,30 @@ def projections(run: dict, extinction: np.ndarray) -> np.ndarray:
     return np.stack([run["totals"].astype(float), *slopes], axis=1)
 
 
-def main() -> None:
-    arguments = options("A gradient in every voxel beside Mitsuba's.", repeats=8)
-    if arguments.repeats < 3:
-        raise SystemExit(f"--repeats = {arguments.repeats} is below 3: no standard deviation to speak of")
+def measure(repeats: int = 8, photons: int = 8 * 8192, samples: int = 2**19) -> dict:
+    """Return the costs of both; `photons` are those of jaxlidar's eight batches, `samples` of Mitsuba."""
+    if repeats < 3:
+        raise SystemExit(f"repeats={repeats} is below 3: no standard deviation to speak of")
     extinction = crown_extinction()
+    task = {"extinction": extinction, "albedo": ALBEDO, "orders": ORDERS, "size": SIZE, "altitude": ALTITUDE}
+    task |= {"radius": RADIUS, "repeats": repeats, "samples": samples}
     load = {"jaxlidar": os.getloadavg()[0]}
-    runs = {"jaxlidar": run_jaxlidar(extinction, arguments.repeats)}
-    notes: dict[str, str] = {}
-    with tempfile.TemporaryDirectory() as folder:
-        file = Path(folder, "given.npz")
-        load["Mitsuba"] = os.getloadavg()[0]
-        np.savez(
-            file,
-            extinction=extinction,
-            albedo=ALBEDO,
-            orders=ORDERS,
-            size=SIZE,
-            altitude=ALTITUDE,
-            radius=RADIUS,
-            repeats=arguments.repeats,
-            samples=SAMPLES,
-        )
-        measurements = run_peer("_peer_mitsuba_gradient.py", file)
+    runs = {"jaxlidar": run_jaxlidar(extinction, repeats, photons)}
+    load["Mitsuba"] = os.getloadavg()[0]
+    measurements = run_peer("_peer_mitsuba_gradient.py", task)
     if isinstance(measurements, str):
-        notes["Mitsuba"] = f"left out: {measurements}"
+        notes = {"Mitsuba": f"left out: {measurements}"}
     else:
-        notes["Mitsuba"] = str(measurements["version"])
+        notes = {"Mitsuba": str(measurements["version"])}
         runs["Mitsuba prbvolpath"] = measurements
     results = []
     reference = projections(runs["jaxlidar"], extinction)
     for name, run in runs.items():
         result = {"code": name, **cost_of(run, extinction)}
         if name != "jaxlidar":
-            own = results[0]
-            result["ratio"] = result["seconds_to_10_percent"] / own["seconds_to_10_percent"]
-            result["cpu_ratio"] = result["cpu_seconds_to_10_percent"] / own["cpu_seconds_to_10_percent"]
+            ours = results[0]
+            result["ratio"] = result["seconds_to_10_percent"] / ours["seconds_to_10_percent"]
+            result["cpu_ratio"] = result["cpu_seconds_to_10_percent"] / ours["cpu_seconds_to_10_percent"]
             values = projections(run, extinction)
             error = np.sqrt(sum(v.var(axis=0, ddof=1) / len(v) for v in (reference, values)))
             z = (values.mean(axis=0) - reference.mean(axis=0)) / error
@@ -147,44 +128,47 @@ def main() -> None:
             result["z"] = dict(zip(labels, map(float, z)))
             result["relative_difference"] = dict(zip(labels, map(float, difference)))
         results.append(result)
-    record = {"machine": {**machine(), "load_before": load}, "notes": notes}
-    work = {"photons": PHOTONS, "samples": SAMPLES, "repeats": arguments.repeats}
-    write_json(arguments.out / "peers_gradient.json", {**record, "work": work, "results": results})
-    head = ("", "s", "error %", "s to 10 %", "CPU s", "times one", "ratio", "s, first", "total", "z")
-    rows = [
-        (
-            r["code"],
-            r["seconds"],
-            100 * r["error"],
-            r["seconds_to_10_percent"],
-            r["cpu_seconds_to_10_percent"],
-            r["times_one_simulation"],
-            r.get("ratio", ""),
-            r["first_call_seconds"],
-            r["total"],
-            ", ".join(f"{v:.1f}" for v in r.get("z", {}).values()),
-        )
-        for r in results
-    ]
-    print_table(head, rows)
-    for name, note in notes.items():
-        print(f"{name}: {note}")
-    draw_record(runs, extinction, arguments.out / "peers_gradient.png")
+    work = {"photons": photons, "samples": samples, "repeats": repeats}
+    drawn = {"runs": runs, "extinction": extinction}
+    return {"load_before": load, "notes": notes, "work": work, "results": results, "drawn": drawn}
 
 
-def draw_record(runs: dict, extinction: np.ndarray, path: Path) -> None:
+def draw(record: dict):
     """Draw the gradient by height: its mean over the voxels of each layer, with two standard errors."""
     figure, axes = new_figure(size=(5, 3.5))
-    count = np.maximum((extinction > 0).sum(axis=(0, 1)), 1)
+    is_crown = record["drawn"]["extinction"] > 0
+    count = np.maximum(is_crown.sum(axis=(0, 1)), 1)
     height = SIZE / N * (np.arange(N) + 0.5)
-    for name, run in runs.items():
-        layers = (run["gradients"] * (extinction > 0)).sum(axis=(1, 2)) / count
+    for name, run in record["drawn"]["runs"].items():
+        layers = (run["gradients"] * is_crown).sum(axis=(1, 2)) / count
         mean, error = layers.mean(axis=0), layers.std(axis=0, ddof=1) / np.sqrt(len(layers))
         axes.errorbar(1e6 * mean, height, xerr=2e6 * error, fmt=".", ms=3, lw=0.8, label=name)
     axes.set(xlabel="mean derivative by a voxel's extinction (1e-6 m)", ylabel="height (m)")
     axes.legend()
-    save_figure(figure, path)
+    return figure
 
 
-if __name__ == "__main__":
-    main()
+def section(record: dict) -> str:
+    columns = {
+        "code": "code",
+        "s": "seconds",
+        "error %": lambda r: 100 * r["error"],
+        "s to 10 %": "seconds_to_10_percent",
+        "CPU s to 10 %": "cpu_seconds_to_10_percent",
+        "times jaxlidar, CPU": lambda r: r.get("cpu_ratio"),
+        "CPU, times one simulation": "cpu_times_one_simulation",
+        "s, first call": "first_call_seconds",
+    }
+
+    def largest(quantity: str) -> float:
+        return max((abs(v) for r in record["results"] for v in r.get(quantity, {}).values()), default=0.0)
+
+    return page_of(
+        "The gradient of all light that a crown of 64³ voxels returns, by the extinction of each, beside "
+        "Mitsuba's path replay without time (`prbvolpath`). The error is that of single voxels, of which "
+        f"each has few paths; sums over voxels differ by at most {percent(largest('relative_difference'))}, "
+        f"{number(largest('z'))} standard errors. Voxels around the crown are empty: for their derivatives "
+        "jaxlidar traces photons once more. Other programs ran at the same time (load "
+        f"{number(max(record['load_before'].values()))}): compare seconds of the CPU.",
+        table(record["results"], columns),
+    )

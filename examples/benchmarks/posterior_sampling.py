@@ -1,7 +1,5 @@
 """Posterior of seven unknowns by the no-U-turn sampler, beside the standard errors of their fit.
 
-Run it as `python examples/benchmarks/posterior_sampling.py [--out figures] [--photons 1024] [--draws 400]`.
-
 A target of `retrieval_coverage.py`, layers of leaves over ground at three wavelengths, has noise of 2 % of
 the peak of each wavelength. Leaf chemistry, two heights, leaf area and the ground's brightness are fitted by
 `inversion.retrieve` and sampled by `inversion.log_density` and blackjax (`pip install '.[bayes]'`). The
@@ -13,24 +11,27 @@ density has small jumps, which lower the acceptance.
 import dataclasses
 import time
 
-import blackjax
 import jax
 import jax.numpy as jnp
 import numpy as np
-from _common import machine, new_figure, options, print_table, save_figure, seconds, write_json
-from blackjax.diagnostics import effective_sample_size
+from _common import new_figure, number, page_of, seconds, table
 from retrieval_coverage import LIDAR, NOISE, RANGES, plan_of, scene_of, unknowns
-from tqdm import trange
+from tqdm import tqdm
 
 import inversion
 import jaxlidar as jl
 
+TITLE = "Posterior of seven unknowns"
+QUICK = {"photons": 64, "draws": 20}
 STEP_SIZE, DRAWS_AT_ONCE = 0.5, 20
 TRUE = {name: 0.45 * low + 0.55 * high for name, (_, (low, high)) in RANGES.items()}
 
 
-def main() -> None:
-    arguments = options("Posterior of seven unknowns.", photons=1024, draws=400)
+def measure(photons: int = 1024, draws: int = 400) -> dict:
+    """Return the fit, the moments of the draws, and the seconds of all steps."""
+    import blackjax
+    from blackjax.diagnostics import effective_sample_size
+
     fine = plan_of(8192, max_step=0.05)
     wave = jl.simulate(LIDAR, scene_of(TRUE), key=jax.random.key(0), plan=fine)
     clean = np.asarray(wave.reflectance, float)
@@ -48,7 +49,7 @@ def main() -> None:
         unknowns(),
         noise=sigma,
         time=wave.time,
-        plan=plan_of(arguments.photons),
+        plan=plan_of(photons),
     )
     fit = inversion.retrieve(problem, key=key)
     spent["fit"] = time.perf_counter() - start
@@ -69,7 +70,7 @@ def main() -> None:
         return jax.lax.scan(draw, state, keys)
 
     gradient = jax.jit(jax.grad(lambda x: density(x)))
-    keys = jax.random.split(jax.random.key(2), (arguments.draws // DRAWS_AT_ONCE, DRAWS_AT_ONCE))
+    keys = jax.random.split(jax.random.key(2), (draws // DRAWS_AT_ONCE, DRAWS_AT_ONCE))
     start = time.perf_counter()
     state = sampler.init(first)
     draw_some = draw_some.lower(state, keys[0]).compile()
@@ -78,12 +79,12 @@ def main() -> None:
     spent["gradient"] = min(seconds(gradient, first) for _ in range(5))
 
     start, blocks = time.perf_counter(), []
-    for number in trange(len(keys), unit="block", desc=f"{DRAWS_AT_ONCE} draws a block"):
-        state, block = draw_some(state, keys[number])
+    for block_keys in tqdm(keys, unit="block", desc=f"{DRAWS_AT_ONCE} draws a block"):
+        state, block = draw_some(state, block_keys)
         blocks.append(jax.tree.map(np.asarray, block))
     spent["sampling"] = time.perf_counter() - start
     positions, acceptance, steps = (np.concatenate(a) for a in zip(*blocks))
-    draws = {name: np.asarray(a, float) for name, a in density.to_natural(positions).items()}
+    samples = {name: np.asarray(a, float) for name, a in density.to_natural(positions).items()}
 
     rows = [
         {
@@ -95,32 +96,24 @@ def main() -> None:
             "standard deviation": float(a.std()),
             "effective draws": float(effective_sample_size(jnp.asarray(a[None]))),
         }
-        for name, a in draws.items()
+        for name, a in samples.items()
     ]
-    print_table(tuple(rows[0]), [tuple(r.values()) for r in rows])
-    record = {
-        "machine": machine(),
-        "photons": arguments.photons,
+    return {
+        "photons": photons,
         "draws": len(positions),
         "seconds": spent,
         "acceptance": float(acceptance.mean()),
         "gradients per draw": float(steps.mean()),
         "unknowns": rows,
+        "drawn": samples,
     }
-    print(
-        f"{spent}; acceptance {record['acceptance']:.2f}, {record['gradients per draw']:.1f} gradients a draw"
-    )
-    arguments.out.mkdir(parents=True, exist_ok=True)
-    write_json(arguments.out / "posterior_sampling.json", record)
-    save_figure(posteriors(draws, rows), arguments.out / "posterior_sampling.png")
 
 
-def posteriors(draws: dict[str, np.ndarray], rows: list[dict]):
+def draw(record: dict):
     """Draw the histogram of each unknown, the normal density of its fit, and the truth."""
     figure, axes = new_figure(4, (11, 4.5), 2)
-    for ax, row in zip(axes.flat, rows):
-        values = draws[row["name"]]
-        ax.hist(values, bins=25, density=True, color="0.75", label="draws")
+    for ax, row in zip(axes.flat, record["unknowns"]):
+        ax.hist(record["drawn"][row["name"]], bins=25, density=True, color="0.75", label="draws")
         x = np.linspace(row["fit"] - 4 * row["stderr"], row["fit"] + 4 * row["stderr"], 200)
         normal = np.exp(-0.5 * ((x - row["fit"]) / row["stderr"]) ** 2)
         ax.plot(
@@ -133,5 +126,24 @@ def posteriors(draws: dict[str, np.ndarray], rows: list[dict]):
     return figure
 
 
-if __name__ == "__main__":
-    main()
+def section(record: dict) -> str:
+    spent = record["seconds"]
+    columns = {
+        "unknown": "name",
+        "truth": lambda r: number(r["true"], 3),
+        "fit": lambda r: f"{number(r['fit'], 3)} ± {number(r['stderr'])}",
+        "posterior": lambda r: f"{number(r['mean'], 3)} ± {number(r['standard deviation'])}",
+        "effective draws": lambda r: f"{r['effective draws']:.0f}",
+    }
+    return page_of(
+        f"A target of `retrieval_coverage.py`, with {record['photons']:,} photons in each of eight batches: "
+        "leaf chemistry, heights, leaf area and brightness of the ground, by `inversion.retrieve`, and by "
+        f"`inversion.log_density` and the no-U-turn sampler of blackjax, {record['draws']} draws of "
+        f"{record['gradients per draw']:.1f} gradients. The covariance of the fit is the sampler's metric, "
+        "and nothing is adapted.",
+        table(record["unknowns"], columns),
+        f"The fit took {number(spent['fit'])} s with its compilation, the compilation of the sampler "
+        f"{number(spent['compilation'])} s, and the draws {number(spent['sampling'])} s: "
+        f"{number(1e3 * spent['gradient'])} ms a gradient. {100 * record['acceptance']:.0f} % of the steps "
+        "were accepted.",
+    )

@@ -1,29 +1,26 @@
 """Cost of thousands of footprints: with shared illumination, shot by shot, and by one call for each.
 
-Run it as `python examples/benchmarks/surveys.py [--out figures] [--side 120] [--shots 2500]`. A forest on
-rolling terrain, at voxels of 1 m: footprints of 25 m as GEDI has them, with all orders, to 1 %; and shots of
-a scanner, 0.3 m wide, at first order, to 2 %.
+A forest on rolling terrain, at voxels of 1 m: footprints of 25 m as GEDI has them, with all orders, to 1 %;
+and shots of a scanner, 0.3 m wide, at first order, to 2 %.
 """
 
-import resource
 import time
 import warnings
-from pathlib import Path
 
 import jax
 import numpy as np
-from _common import machine, new_figure, options, print_table, save_figure, write_json
-from matplotlib.ticker import LogLocator, NullFormatter
+from _common import label_log_axis, new_figure, number, page_of, peak_gigabytes, percent, table
 
 import jaxlidar as jl
 
+TITLE = "Cost of thousands of footprints"
+QUICK = {"side": 40, "shots": 16, "scans": 20, "largest": 50}
 # Width of terrain around the trees, m.
 MARGIN = 45
 STEMS_PER_HECTARE = 280
 TALLEST = 20
 # Relative tolerance of the curves, and of shots with a field of view or off nadir.
 ROUGH_TOLERANCE, VIEWED_TOLERANCE = 0.05, 0.03
-COLUMNS = "shots", "tolerance", "ms per shot", "error, median"
 # Full angle of the receiver that sees footprints of 25 m from 400 km, mrad.
 FIELD_OF_VIEW = 0.0625
 
@@ -121,61 +118,96 @@ def one_by_one(survey: jl.Survey, scene: jl.Scene, shots: int, **settings) -> di
     }
 
 
-def draw(record: dict, out: Path) -> None:
-    """Draw the figure of a record."""
-    figure, axes = new_figure(2, size=(9, 4))
-    axes[0].loglog([r["shots"] for r in record["by shots"]], [r["seconds"] for r in record["by shots"]], "o-")
-    side = f"{record['side']} m"
-    axes[0].set(xlabel="footprints", ylabel="s, compiled", title=f"{side} x {side}, to {ROUGH_TOLERANCE:.0%}")
-    area = [r["side"] ** 2 / 1e4 for r in record["by side"]]
-    axes[1].loglog(area, [r["seconds"] for r in record["by side"]], "o-")
-    axes[1].set(
-        xlabel="ha", ylabel="s, compiled", title=f"as many footprints per hectare, to {ROUGH_TOLERANCE:.0%}"
-    )
-    for panel in axes:
-        # The axis spans less than two powers of ten: label numbers in between as well.
-        panel.yaxis.set(
-            major_locator=LogLocator(subs=(1, 2, 5)), major_formatter="{x:g}", minor_formatter=NullFormatter()
-        )
-    save_figure(figure, out / "surveys.png")
+def measure(side: int = 120, shots: int = 2500, scans: int = 5000, largest: int = 400) -> dict:
+    """Return the costs of all strategies over a forest `side` m wide, and by the shots and the area.
 
-
-def main() -> None:
-    arguments = options("Cost of surveys.", side=120, shots=2500, scans=5000)
+    `shots`: footprints; fields of view and angles off nadir have a quarter. - `scans`: shots of the scanner.
+    - `largest`: width of the largest area, m.
+    """
     warnings.simplefilter("ignore", jl.LateLightWarning)
     warnings.simplefilter("ignore", jl.OffMapWarning)
-    side, scene = arguments.side, forest(arguments.side)
-    footprints, scans = grid(side, arguments.shots), scan(side, arguments.scans)
-    narrow_view = grid(side, arguments.shots // 4, field_of_view=FIELD_OF_VIEW)
-    oblique = grid(side, arguments.shots // 4, zenith=5.0)
+    scene, footprints, scanner = forest(side), grid(side, shots), scan(side, scans)
+    narrow_view = grid(side, shots // 4, field_of_view=FIELD_OF_VIEW)
+    oblique = grid(side, shots // 4, zenith=5.0)
+    precise, viewed, scanned = {"rtol": 0.01}, {"rtol": VIEWED_TOLERANCE}, {"rtol": 0.02, "max_orders": 1}
     strategies = {
-        "footprints, shared": warm(footprints, scene, rtol=0.01),
-        "footprints, apart": warm(every_nth_shot(footprints), scene, rtol=0.01, shared=False),
-        "footprints, simulate": one_by_one(footprints, scene, 5, rtol=0.01),
-        "field of view, shared": warm(narrow_view, scene, rtol=VIEWED_TOLERANCE),
-        "field of view, apart": warm(every_nth_shot(narrow_view), scene, rtol=VIEWED_TOLERANCE, shared=False),
-        "5 degrees off nadir, shared": warm(oblique, scene, rtol=VIEWED_TOLERANCE),
-        "5 degrees off nadir, apart": warm(
-            every_nth_shot(oblique), scene, rtol=VIEWED_TOLERANCE, shared=False
-        ),
-        "scan, apart": warm(scans, scene, rtol=0.02, max_orders=1),
-        "scan, simulate": one_by_one(scans, scene, 50, rtol=0.02, max_orders=1),
+        "footprints, shared": warm(footprints, scene, **precise),
+        "footprints, apart": warm(every_nth_shot(footprints), scene, shared=False, **precise),
+        "footprints, simulate": one_by_one(footprints, scene, 5, **precise),
+        "field of view, shared": warm(narrow_view, scene, **viewed),
+        "field of view, apart": warm(every_nth_shot(narrow_view), scene, shared=False, **viewed),
+        "5 degrees off nadir, shared": warm(oblique, scene, **viewed),
+        "5 degrees off nadir, apart": warm(every_nth_shot(oblique), scene, shared=False, **viewed),
+        "scan, apart": warm(scanner, scene, **scanned),
+        "scan, simulate": one_by_one(scanner, scene, 50, **scanned),
     }
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
-    by_shots = [warm(grid(side, n), scene, rtol=ROUGH_TOLERANCE) for n in (1, 9, 100, 1024, 10000)]
+    peak = peak_gigabytes()
+    counts = [n for n in (1, 9, 100, 1024, 10000) if n <= 4 * shots]
+    by_shots = [warm(grid(side, n), scene, rtol=ROUGH_TOLERANCE) for n in counts]
     by_side = []
-    for other_side in (50, 100, 200, 400):
-        other_scene, per_area = forest(other_side), round(arguments.shots * (other_side / side) ** 2)
-        by_side.append(
-            {"side": other_side, **warm(grid(other_side, per_area), other_scene, rtol=ROUGH_TOLERANCE)}
-        )
-    record = {"machine": machine(), "side": side, "peak GB": peak, "ways": strategies}
-    record |= {"rough": ROUGH_TOLERANCE, "by shots": by_shots, "by side": by_side}
-    write_json(arguments.out / "surveys.json", record)
-    draw(record, arguments.out)
-    rows = [(name, *(r[k] for k in COLUMNS)) for name, r in strategies.items()]
-    print_table(("way", *COLUMNS), rows)
+    for other_side in (n for n in (50, 100, 200, 400) if n <= largest):
+        other_scene, per_area = forest(other_side), round(shots * (other_side / side) ** 2)
+        row = warm(grid(other_side, per_area), other_scene, rtol=ROUGH_TOLERANCE)
+        by_side.append({"side": other_side, **row})
+    return {
+        "side": side,
+        "peak GB": peak,
+        "strategies": strategies,
+        "rough": ROUGH_TOLERANCE,
+        "by shots": by_shots,
+        "by side": by_side,
+    }
 
 
-if __name__ == "__main__":
-    main()
+def draw(record: dict):
+    """Draw the seconds by the number of footprints and by the area."""
+    figure, axes = new_figure(2, size=(9, 4))
+    side, rough = f"{record['side']} m", f"to {record['rough']:.0%}"
+    by_shots, by_side = record["by shots"], record["by side"]
+    axes[0].loglog([r["shots"] for r in by_shots], [r["seconds"] for r in by_shots], "o-")
+    axes[0].set(xlabel="footprints", ylabel="s, compiled", title=f"{side} x {side}, {rough}")
+    axes[1].loglog([r["side"] ** 2 / 1e4 for r in by_side], [r["seconds"] for r in by_side], "o-")
+    axes[1].set(xlabel="ha", ylabel="s, compiled", title=f"as many footprints per hectare, {rough}")
+    for panel in axes:
+        label_log_axis(panel.yaxis, 1, 2, 5)
+    return figure
+
+
+def section(record: dict) -> str:
+    def times_longer(slow: str, fast: str) -> str:
+        return number(strategies[slow]["ms per shot"] / strategies[fast]["ms per shot"])
+
+    strategies, side, rough = record["strategies"], record["side"], percent(record["rough"])
+    largest = record["by side"][-1]
+    hectares = largest["side"] ** 2 / 1e4
+    hours = 100 * largest["seconds"] / hectares * record["machine"]["cores"] / 3600
+    columns = {
+        "strategy": "strategy",
+        "shots": "shots",
+        "tolerance": lambda r: percent(r["tolerance"]),
+        "ms a shot": "ms per shot",
+        "error, median": lambda r: percent(r["error, median"]),
+    }
+    return page_of(
+        f"Trees of {side} m x {side} m at voxels of 1 m over rolling terrain. Footprints of 25 m from "
+        "orbit, all orders, by three strategies: shared illumination (`shared`); shot by shot in one "
+        "program (`apart`); one call of `simulate` for each. The same with a field of view as wide as the "
+        "footprints, and off nadir. Shots of a scanner, 0.3 m wide, at first order. The tolerance is that "
+        "of every single shot.",
+        table([{"strategy": name, **r} for name, r in strategies.items()], columns),
+        f"Shared illumination is {times_longer('footprints, simulate', 'footprints, shared')} times faster "
+        "than single calls, one program for a scan "
+        f"{times_longer('scan, simulate', 'scan, apart')} times. One process with all of these took at most "
+        f"{number(record['peak GB'])} GB.",
+        f"The number of footprints over the same trees, to {rough}, hardly changes the cost:",
+        table(record["by shots"], {"footprints": "shots", "s": "seconds", "ms each": "ms per shot"}),
+        f"Larger areas with the same number of footprints per hectare, to {rough}:",
+        table(
+            record["by side"],
+            {"ha": lambda r: r["side"] ** 2 / 1e4, "footprints": "shots", "s": "seconds"},
+        ),
+        f"Extrapolated, as tiles are independent: a square kilometre to {rough} takes {number(hours)} core "
+        f"hours, and a country of 100,000 km2 {number(hours * 1e5 / 24 / 1e4)} days of 10,000 cores. "
+        "Waveforms are written as they are computed; of a map, with 4 bytes a voxel, only the tiles in "
+        "work (`SceneParts`) need to fit into memory.",
+    )

@@ -1,13 +1,11 @@
 """The crown of `examples/benchmarks/peers.py` by jaxlidar and by another code."""
 
-import tempfile
 from functools import partial
-from pathlib import Path
 
-import numpy as np
+from _peer import run_peer
 from _validation import finish, with_progress
 from _waveforms import draw_cases, rows_of
-from peers import CASES, crown_extinction, run_jaxlidar, run_peer, sampled, worker_task
+from peers import CASES, crown_extinction, run_jaxlidar, sampled, worker_task
 
 
 def compare(
@@ -22,12 +20,8 @@ def compare(
         c: run_jaxlidar(extinction, c, pulse, arguments.repeats, orders)["waves"]
         for c in with_progress(arguments, cases)
     }
-    with tempfile.TemporaryDirectory() as folder:
-        file = Path(folder, "given.npz")
-        np.savez(
-            file, **worker_task(extinction, arguments.repeats) | {"orders": orders} | dict(worker_options)
-        )
-        measurements = run_peer(worker, file)
+    task = worker_task(extinction, arguments.repeats) | {"orders": orders} | dict(worker_options)
+    measurements = run_peer(worker, task)
     if isinstance(measurements, str):
         raise SystemExit(f"{code} does not run here: {measurements}")
     if not measurements.get("corrected", True):

@@ -1,4 +1,4 @@
-"""Shared by the scripts: the command line, rows of comparisons, the record, and figures of differences."""
+"""Shared by the scripts: the command line, rows of comparisons, the record, its table, and figures."""
 
 import argparse
 import datetime
@@ -13,7 +13,7 @@ EXAMPLES = Path(__file__).resolve().parents[1]
 # The scripts also use modules of the benchmarks and of the fits of recorded shots.
 sys.path += [folder for folder in (str(EXAMPLES / "benchmarks"), str(EXAMPLES)) if folder not in sys.path]
 
-from _common import machine, plt, print_table, save_figure, write_json  # noqa: E402
+from _common import machine, number, page_of, percent, plt, save_figure, table, write_json  # noqa: E402, F401
 from tqdm import tqdm  # noqa: E402
 
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#1A1A1A")
@@ -96,6 +96,21 @@ def summary(rows: Sequence[dict]) -> list[dict]:
     return worst
 
 
+# What the table says of a row of the summary.
+SUMMARY_COLUMNS = {
+    "quantity": "what",
+    "reference": "against",
+    "cases": "cases",
+    "worst case": "case",
+    "jaxlidar": lambda r: number(r["here"], 4),
+    "reference value": lambda r: number(r["there"], 4) + ("" if r["unit"] == "1" else f" {r['unit']}"),
+    "difference": "difference",
+    "its error": lambda r: f"{'≤' if 'bound' in r else '±'} {number(error_of(r))}",
+    "root mean square of all over their errors": "rms over error",
+    "within two standard errors, or the bound": lambda r: percent(r["within"], 3),
+}
+
+
 def draw_differences(ax, rows: Sequence[dict], abscissa: str | None = None, **style) -> None:
     """Draw differences with bars of two standard errors, or between lines of their bounds.
 
@@ -152,21 +167,6 @@ def finish(
     draw(figure)
     save_figure(figure, arguments.out / f"{name}.png")
     if not arguments.quiet:
-        header = (
-            "what",
-            "cases",
-            "worst case",
-            "here",
-            "there",
-            "difference",
-            "error",
-            "rms over it",
-            "within",
-        )
-        lines = []
-        for r in record["summary"]:
-            values = (r["here"], r["there"], r["difference"], error_of(r), r["rms over error"], r["within"])
-            lines.append((r["what"], r["cases"], r["case"], *values))
-        print_table(header, lines)
+        print(table(record["summary"], SUMMARY_COLUMNS))
         print("written:", arguments.out / f"{name}.json", arguments.out / f"{name}.png")
     return complete

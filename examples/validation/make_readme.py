@@ -7,8 +7,7 @@ examples/validation/results`, has renewed its record.
 import json
 from pathlib import Path
 
-from _validation import error_of
-from _writing import number, page_of, table
+from _validation import SUMMARY_COLUMNS, page_of, percent, table
 
 from jaxlidar.io import atomic_write
 
@@ -49,64 +48,29 @@ def load() -> dict[str, dict]:
     return {path.stem: json.loads(path.read_text()) for path in paths if path.exists()}
 
 
-def table_line(summary_row: dict, script: str) -> list[str]:
-    """Return the line of the table for one quantity."""
-    return [
-        f"[{summary_row['what']}](#{script.replace('_', '-')})",
-        summary_row["against"],
-        f"{summary_row['cases']:,}",
-        summary_row["case"],
-        number(summary_row["here"], 4),
-        number(summary_row["there"], 4) + ("" if summary_row["unit"] == "1" else f" {summary_row['unit']}"),
-        number(summary_row["difference"]),
-        f"{'≤' if 'bound' in summary_row else '±'} {number(error_of(summary_row))}",
-        number(summary_row["rms over error"]),
-        f"{number(100 * summary_row['within'], 3)} %",
-    ]
-
-
-HEADINGS = (
-    *(
-        "quantity",
-        "reference",
-        "cases",
-        "worst case",
-        "jaxlidar",
-        "reference value",
-        "difference",
-        "its error",
-    ),
-    *("root mean square of all over their errors", "within two standard errors, or the bound"),
-)
-
-
-COST_HEADINGS = ("case", "code", "s", "error", "s to 1 %", "CPU s to 1 %", "times jaxlidar", "s, first call")
-
-
 def costs(record: dict) -> tuple[str, ...]:
     """Return the paragraphs of what both codes cost, where a script has measured it."""
     if "costs" not in record:
         return ()
     ours = {cost["case"]: cost for cost in record["costs"] if cost["code"] == "jaxlidar"}
-    lines = [
-        [
-            cost["case"],
-            cost["code"],
-            number(cost["seconds"]),
-            f"{number(100 * cost['error'])} %",
-            number(cost["seconds_to_1_percent"]),
-            number(cost["cpu_seconds_to_1_percent"]),
-            number(cost["cpu_seconds_to_1_percent"] / ours[cost["case"]]["cpu_seconds_to_1_percent"]),
-            number(cost["first_call_seconds"]),
-        ]
-        for cost in record["costs"]
-    ]
+    columns = {
+        "case": "case",
+        "code": "code",
+        "s": "seconds",
+        "error": lambda cost: percent(cost["error"]),
+        "s to 1 %": "seconds_to_1_percent",
+        "CPU s to 1 %": "cpu_seconds_to_1_percent",
+        "times jaxlidar": lambda cost: (
+            cost["cpu_seconds_to_1_percent"] / ours[cost["case"]]["cpu_seconds_to_1_percent"]
+        ),
+        "s, first call": "first_call_seconds",
+    }
     text = (
         "What a waveform costs: seconds and error (root mean square over samples above 1 % of the peak) of "
         "one repetition, the seconds of repetitions until the error is 1 %, and their ratio in CPU seconds. "
         f"Both codes ran on the same {record['machine']['cores']} cores."
     )
-    return text, table(COST_HEADINGS, lines)
+    return text, table(record["costs"], columns)
 
 
 def section(script: str, record: dict) -> str:
@@ -128,10 +92,13 @@ def section(script: str, record: dict) -> str:
 def page() -> str:
     """Return the text of README.md."""
     records = load()
-    lines = [
-        table_line(summary_row, name) for name, record in records.items() for summary_row in record["summary"]
+    rows = [
+        {**r, "what": f"[{r['what']}](#{script.replace('_', '-')})"}
+        for script, record in records.items()
+        for r in record["summary"]
     ]
-    return page_of(HEAD, TABLE, table(HEADINGS, lines), *(section(n, r) for n, r in records.items())) + "\n"
+    sections = (section(script, record) for script, record in records.items())
+    return page_of(HEAD, TABLE, table(rows, SUMMARY_COLUMNS), *sections) + "\n"
 
 
 if __name__ == "__main__":

@@ -18,9 +18,10 @@ from pathlib import Path
 
 import numpy as np
 import trimesh
+from _peer import run_peer
 from _validation import COLOURS, finish, options, with_progress
 from _waveforms import draw_cases, rows_of
-from peers import FINE, SAMPLES, WINDOW, cost_of, repeat_jaxlidar, run_peer, sampled
+from peers import FINE, SAMPLES, WINDOW, cost_of, repeat_jaxlidar, sampled
 
 import jaxlidar as jl
 
@@ -75,9 +76,7 @@ def run_renderer(parts, repeats):
             **{"altitude": float(LIDAR.altitude), "zenith": ZENITH, "radius": RADIUS, "fine": FINE},
             **{"start": WINDOW[0] - 0.5, "count": round(SAMPLES / FINE), "mitransient_samples": PATHS},
         }
-        file = Path(folder, "task.npz")
-        np.savez(file, **task)
-        return run_peer("_peer_mitransient.py", file)
+        return run_peer("_peer_mitransient.py", task)
 
 
 def draw(figure, parts, rows):

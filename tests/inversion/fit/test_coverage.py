@@ -13,12 +13,11 @@ FOLDER = Path(__file__).parents[3] / "examples" / "benchmarks"
 def test_retrievals_reach_the_bound_and_their_intervals_cover(tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(str(FOLDER))
     monkeypatch.delitem(sys.modules, "_common", raising=False)
-    options = ["--targets", "16", "--photons", "8192", "--starts", "2", "--exact", "2"]
-    monkeypatch.setattr(sys, "argv", ["retrieval_coverage.py", "--out", str(tmp_path), *options])
     try:
-        summary = importlib.import_module("retrieval_coverage").main()
+        sizes = {"targets": 16, "photons": 8192, "starts": 2, "exact": 2}
+        summary = importlib.import_module("run").run("retrieval_coverage", tmp_path, **sizes)
     finally:
-        for name in ("_common", "retrieval_coverage"):
+        for name in ("_common", "run", "retrieval_coverage"):
             sys.modules.pop(name, None)
     assert summary["converged"] >= 0.9
     # 112 intervals, of which neighbours share a fit: 0.95 with a standard error of about 0.03.
