@@ -6,11 +6,12 @@ import tempfile
 import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 
-def run_peer(worker: str, task: Mapping[str, object]) -> dict[str, np.ndarray] | str:
+def run_peer(worker: str, task: Mapping[str, Any]) -> dict[str, np.ndarray] | str:
     """Run a worker on the arrays of a task; return its arrays, or the reason of its failure."""
     with tempfile.TemporaryDirectory() as folder:
         files = [str(Path(folder, name)) for name in ("task.npz", "result.npz")]

@@ -204,67 +204,53 @@ def convergence_order(knob: Sequence[float], error: Sequence[float], floor: floa
     )
 
 
-def sweep(name: str, values: Sequence[float], make: Callable, reference: np.ndarray) -> dict:
-    """Run a setting through its values; `make(value)` returns case, plan and True for double precision."""
+def sweep(values: Sequence[float], settings_of: Callable, reference: np.ndarray) -> dict:
+    """Run a setting through its values; `settings_of(value)` returns case, plan and, for doubles, True."""
     points = []
     for value in values:
-        case, plan, double = make(value)
+        case, plan, x64 = settings_of(value)
         # Eight batches average out the noise of random cases.
-        batches = run_batches(case, 8, plan, x64=double)
-        points.append(
-            {
-                "value": value,
-                "error": relative(batches.waves, reference),
-                "seconds": batches.seconds,
-                "memory": batches.memory,
-            }
-        )
-    slope = convergence_order([p["value"] for p in points], [p["error"] for p in points])
-    return {"knob": name, "order": slope, "points": points}
+        batches = run_batches(case, 8, plan, x64=x64)
+        cost = {"seconds": batches.seconds, "memory": batches.memory}
+        points.append({"value": value, "error": relative(batches.waves, reference), **cost})
+    return {
+        "order": convergence_order([p["value"] for p in points], [p["error"] for p in points]),
+        "points": points,
+    }
 
 
 def deterministic(all_cases: dict[str, AccuracyCase]) -> dict[str, dict]:
     """Return the errors of settings that are not random, each by itself."""
     ground, stand, tree = (all_cases[n] for n in ("ground", "dense stand", "tree"))
-    single = {"max_orders": 1, "footprint": "fixed"}
     voxels = {size: dataclasses.replace(tree, scene=tree_scene(size)) for size in (0.125, 0.25, 0.5, 1.0)}
-    finest = run_batches(ground, 1, ground.plan(bin_width=1 / 64), x64=True).mean
-    fine_rays = run_batches(tree, 1, tree.plan(**single, n_rays=131072)).mean
-    fine_steps = run_batches(stand, 1, stand.plan(**single, n_rays=64, max_step=0.03), x64=True).mean
-    fine_voxels = run_batches(voxels[0.125], 1, voxels[0.125].plan(**single)).mean
-    sweeps = (
-        (
-            "fine bin (ns)",
+    single = {"max_orders": 1, "footprint": "fixed"}
+    steps = {**single, "n_rays": 64}
+
+    def finest(case: AccuracyCase, x64: bool = False, **settings) -> np.ndarray:
+        return run_batches(case, 1, case.plan(**settings), x64=x64).mean
+
+    finest_steps = finest(stand, x64=True, **steps, max_step=0.03)
+    return {
+        "fine bin (ns)": sweep(
             (1.0, 0.5, 0.25, 0.125),
             lambda v: (ground, ground.plan(bin_width=v), True),
-            finest,
+            finest(ground, x64=True, bin_width=1 / 64),
         ),
-        (
-            "rays",
+        "rays": sweep(
             (64, 256, 1024, 4096, 16384),
             lambda v: (tree, tree.plan(**single, n_rays=v), False),
-            fine_rays,
+            finest(tree, **single, n_rays=131072),
         ),
-        (
-            "step (m)",
-            (10.0, 2.5, 0.6, 0.15),
-            lambda v: (stand, stand.plan(**single, n_rays=64, max_step=v), False),
-            fine_steps,
+        "step (m)": sweep(
+            (10.0, 2.5, 0.6, 0.15), lambda v: (stand, stand.plan(**steps, max_step=v), False), finest_steps
         ),
-        (
-            "bits",
-            (32, 64),
-            lambda v: (stand, stand.plan(**single, n_rays=64, max_step=0.15), v == 64),
-            fine_steps,
-        ),
-        (
-            "voxel (m)",
+        "bits": sweep((32, 64), lambda v: (stand, stand.plan(**steps, max_step=0.15), v == 64), finest_steps),
+        "voxel (m)": sweep(
             (1.0, 0.5, 0.25),
             lambda v: (voxels[v], voxels[v].plan(**single), False),
-            fine_voxels,
+            finest(voxels[0.125], **single),
         ),
-    )
-    return {name: sweep(name, *settings) for name, *settings in sweeps}
+    }
 
 
 def random_knobs(case: AccuracyCase, batches: int, photons: int) -> dict:

@@ -1,13 +1,11 @@
 """Gradients in every voxel against one simulation, by `jax.grad` of `simulate`: time, memory, compilation.
 
 A map of 20 m x 20 m x 20 m of leaves over ground, in 20^3 and in 100^3 voxels, at first order and with eight
-orders, seen from nadir by a beam of 10 m. The gradient is that of a linear function of the waveform with
-respect to the leaf area density of every voxel. Compared are programs of `jax.jit`: `simulate`, and
-the gradient with the value (within a transformation each simulates eight batches); both where half of the
-voxels are empty; further, `simulate` as users call it, with the same photons. Seconds are of the processor,
-the fastest of some rounds in turns: other load of the machine matters less. Memory is what the compiler
-reserves beside arguments and results; it is given for four times the rays and photons, too. Reverse mode by
-replay is explained in `jaxlidar/trace/derivatives/replay.py`.
+orders, seen from nadir by a beam of 10 m. The function of the waveform is linear. Compared are programs of
+`jax.jit`: `simulate`, and the gradient with the value (within a transformation each simulates eight batches).
+Seconds are of the processor, the fastest of some rounds in turns: other load of the machine matters less.
+Memory is what the compiler reserves beside arguments and results. Reverse mode by replay is explained in
+`jaxlidar/trace/derivatives/replay.py`.
 """
 
 import time

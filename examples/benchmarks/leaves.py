@@ -1,9 +1,8 @@
 """Leaves that are hit or missed beside voxels: shots without a return, and what both cost.
 
-A RIEGL VZ-400 stands 1.5 m above the ground below ellipsoidal crowns in voxels of 0.5 m, and sends shots into
-three rings of zenith angles. The share of shots without a return is the gap probability of the crowns if
-leaves are hit or missed; voxels return the expected light of their leaves to nearly every shot. A hectare of
-leaf area index 4 is a stand whose trees share the leaves of four individuals, seen from 500 m above.
+The scanner stands 1.5 m above the ground below ellipsoidal crowns in voxels of 0.5 m. The share of shots
+without a return is the gap probability of the crowns if leaves are hit or missed. Trees of the hectare share
+the leaves of four individuals.
 """
 
 import dataclasses

@@ -1,15 +1,8 @@
 """How far voxel maps are from the triangles of the same tree, waveform by waveform.
 
 The tree is the paper's (Table 2), with and without leaves. As triangles it has leaves of random places and
-orientations in each clump. There are two kinds of voxel maps:
-
-- by area: leaf and bark attenuate by half the leaf area and a quarter of the surface of wood per volume
-  (`leaf_area=`, `wood="surface"`);
-- by volume: the paper's probability map, by the fractions of voxels that clumps and wood fill.
-
-Both have the optics of the triangles, and light of the first order returns through its gap (the hot spot), as
-it does among triangles. Each simulation is repeated with independent keys, from which standard errors follow.
-What noise adds to the root mean square of a difference is subtracted.
+orientations in each clump; `section` explains the two kinds of voxel maps. Each simulation is repeated with
+independent keys, from which standard errors follow.
 """
 
 import statistics

@@ -51,8 +51,8 @@ def kernel(survey: jl.Survey, scene: jl.Scene, plan: jl.Plan):
     radius, positions = float(survey.footprint_radius[0]), np.asarray(survey.position, f4)
 
     def run(rays: int):
-        number = np.arange(rays) + 0.5
-        distance, turn = radius * np.sqrt(-0.5 * np.log1p(-number / rays)), 2.4 * number
+        ray = np.arange(rays) + 0.5
+        distance, turn = radius * np.sqrt(-0.5 * np.log1p(-ray / rays)), 2.4 * ray
         across = np.stack([distance * np.cos(turn), distance * np.sin(turn)], axis=1).astype(f4)
         times = f4(bins.start), f4(bins.width), bins.count
         return march_shots(positions, directions.astype(f4), across, *arrays, corner, *times)

@@ -1,11 +1,7 @@
 """Posterior of seven unknowns by the no-U-turn sampler, beside the standard errors of their fit.
 
-A target of `retrieval_coverage.py`, layers of leaves over ground at three wavelengths, has noise of 2 % of
-the peak of each wavelength. Leaf chemistry, two heights, leaf area and the ground's brightness are fitted by
-`inversion.retrieve` and sampled by `inversion.log_density` and blackjax (`pip install '.[bayes]'`). The
-covariance of the fit is the metric of the sampler, whose step is fixed: nothing is adapted. Random numbers of
-the simulation are the same at each evaluation; photons change their paths with the unknowns, so that the
-density has small jumps, which lower the acceptance.
+Needs blackjax (`pip install '.[bayes]'`). Random numbers of the simulation are the same at each evaluation;
+photons change their paths with the unknowns, so that the density has small jumps, which lower the acceptance.
 """
 
 import dataclasses

@@ -1,9 +1,8 @@
 """One scene from many records: leaf area in voxels, from wide footprints and from narrow shots, and terrain.
 
-Footprints 25 m across over a stand of 60 m x 60 m x 25 m in the open, simulated at first order, with normal
-noise of 2 % of the largest sample. Leaves vary over tens of metres ("even"), or are in crowns of 3 to 6 m
-("crowns"). Priors: a Markov field, which spreads leaves evenly within a footprint; and clumps of the density
-and of the mean size of the crowns, or of three quarters of their height.
+Records are simulated at first order, in the open. Priors: a Markov field, which spreads leaves evenly within
+a footprint; and clumps of the density and of the mean size of the crowns, or of three quarters of their
+height.
 """
 
 import statistics
