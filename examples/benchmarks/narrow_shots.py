@@ -27,7 +27,7 @@ from jaxlidar.planning.plan import MIN_BATCHES
 from jaxlidar.survey.per_shot import LEAST_PARTS_TIMES_RTOL, RAYS_OF_PART
 
 TITLE = "Cost of narrow shots"
-QUICK = {"shots": 100, "million": 200, "line": 100, "finest": 0.5}
+QUICK = {"shots": 100, "million": 200, "line": 100, "finest": 1.0}
 SIDE, ROUNDS = 120, 5
 TOLERANCES = (0.05, 0.02)
 # Edges of voxels, m.

@@ -45,7 +45,7 @@ from simulation_cost import LIDAR, ORDERS, SIZE, WINDOW, N, scenes
 import jaxlidar as jl
 
 TITLE = "Other codes"
-QUICK = {"repeats": 3, "rtol": 0.2, "work": 0.01}
+QUICK = {"repeats": 3, "rtol": 0.2, "work": 0.01, "cases": ("alone",)}
 FINE, SAMPLES, LEVELS = 0.05, 200, 200
 ALBEDO, SOIL = 0.9, 0.3
 PULSES = {"instant": 0.0, "6 ns": 6.0}
@@ -183,19 +183,20 @@ def agreement(a: np.ndarray, b: np.ndarray) -> dict[str, float]:
     }
 
 
-def measured_by_all(repeats: int, rtol: float, work: float) -> tuple[dict, dict, dict]:
+def measured_by_all(repeats: int, rtol: float, work: float, cases: tuple[str, ...]) -> tuple[dict, ...]:
     """Return runs by case and pulse and by code, notes on the peers, and the load before each."""
     extinction = crown_extinction()
     load = {"jaxlidar": os.getloadavg()[0]}
     runs = {
         (case, pulse): {"jaxlidar": run_jaxlidar(extinction, case, fwhm, repeats, rtol=rtol)}
-        for case in CASES
+        for case in cases
         for pulse, fwhm in PULSES.items()
     }
+    task = {**worker_task(extinction, repeats, work), "cases": cases}
     notes: dict[str, str] = {}
     for name, worker in (("mitransient", "_peer_mitransient.py"), ("MCX-CL", "_peer_mcx.py")):
         load[name] = os.getloadavg()[0]
-        measurements = run_peer(worker, worker_task(extinction, repeats, work))
+        measurements = run_peer(worker, task)
         if isinstance(measurements, str):
             notes[name] = f"left out: {measurements}"
             continue
@@ -210,11 +211,13 @@ def measured_by_all(repeats: int, rtol: float, work: float) -> tuple[dict, dict,
     return runs, notes, load
 
 
-def measure(repeats: int = 8, rtol: float = 0.01, work: float = 1.0) -> dict:
+def measure(
+    repeats: int = 8, rtol: float = 0.01, work: float = 1.0, cases: tuple[str, ...] = tuple(CASES)
+) -> dict:
     """Return the costs of all codes; `rtol` is that of jaxlidar, `work` a factor of that of the peers."""
     if repeats < 3:
         raise SystemExit(f"repeats={repeats} is below 3: no standard deviation to speak of")
-    runs, notes, load = measured_by_all(repeats, rtol, work)
+    runs, notes, load = measured_by_all(repeats, rtol, work, cases)
     results = []
     for (case, pulse), run in runs.items():
         ours = cost_of(run["jaxlidar"])
@@ -243,7 +246,7 @@ def draw(record: dict):
     colour = {name: f"C{i}" for i, name in enumerate(names)}
     style = dict(zip(names, ("-", "--", "-.", ":")))
     at = WINDOW[0] + np.arange(SAMPLES)
-    for ax, case in zip(axes, CASES):
+    for ax, case in zip(axes, dict.fromkeys(case for case, _ in runs)):
         for name, run in runs[case, "6 ns"].items():
             mean, deviation = run["waves"].mean(axis=0), run["waves"].std(axis=0, ddof=1)
             ax.plot(at, mean, style[name], color=colour[name], lw=1.5, label=name)
