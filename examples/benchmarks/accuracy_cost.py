@@ -253,15 +253,15 @@ def deterministic(all_cases: dict[str, AccuracyCase]) -> dict[str, dict]:
     }
 
 
-def random_knobs(case: AccuracyCase, batches: int, photons: int) -> dict:
+def random_knobs(case: AccuracyCase, analog: BatchRun, photons: int) -> dict:
     """Return errors and times of the default, one deposit a flight, fewer orders and analog photons."""
+    batches = len(analog.waves)
     size = {"n_photons": 8 * photons, "n_rays": 1024}
     plan = case.plan(**size)
     plans = {"default": plan, "one deposit a flight": plan.with_config(deposits_per_flight=1)}
     long = run_batches(case, 8 * batches, case.plan(**size, bin_width=0.25), seed=10**6)
     reference = long.mean
     runs = {key: run_batches(case, batches, variant) for key, variant in plans.items()}
-    analog = run_analog(case, 16 * photons, batches)
     record = {
         "reference_error": batch_spread(long, reference) / np.sqrt(len(long.waves)),
         "photons_per_batch": photons,
@@ -286,10 +286,10 @@ def random_knobs(case: AccuracyCase, batches: int, photons: int) -> dict:
     return record
 
 
-def ground_times(case: AccuracyCase, photons: int) -> dict:
+def ground_times(case: AccuracyCase, analog: BatchRun) -> dict:
     """Return errors and times of the ground, which is random for the analog estimator alone."""
     reference = run_batches(case, 1, case.plan(bin_width=1 / 64), x64=True).mean
-    ours, analog = run_batches(case, 1, case.plan()), run_analog(case, 16 * photons, 32)
+    ours = run_batches(case, 1, case.plan())
     points = [{"seconds": ours.seconds, "error": relative(ours.mean, reference)}]
     return {
         "curves": {"default": points, "analog": error_curve(analog, reference)},
@@ -309,10 +309,16 @@ def plot_curves(ax, curves, x: str, y: str = "error", scales: str = "loglog", sk
 def measure(batches: int = 64, photons: int = 2048, n_scenes: int = 4) -> dict:
     """Return errors and times of the first scenes, and of settings that are not random."""
     all_cases = cases()
-    scenes = {
-        name: ground_times(case, photons) if case.orders == 1 else random_knobs(case, batches, photons)
+    # First: after programs in double precision, those of the analog estimator do not run.
+    analog = {
+        name: run_analog(case, 16 * photons, 32 if case.orders == 1 else batches)
         for name, case in list(all_cases.items())[:n_scenes]
     }
+    scenes = {}
+    for name, groups in analog.items():
+        case = all_cases[name]
+        is_ground = case.orders == 1
+        scenes[name] = ground_times(case, groups) if is_ground else random_knobs(case, groups, photons)
     return {"targets": TARGETS, "scenes": scenes, "knobs": deterministic(all_cases)}
 
 

@@ -22,7 +22,7 @@ import jaxlidar as jl
 from inversion import Unknown
 
 TITLE = "Accuracy and coverage of retrievals"
-QUICK = {"targets": 2, "photons": 512, "starts": 1, "exact": 1}
+QUICK = {"targets": 2, "photons": 128, "starts": 1, "exact": 1}
 LIDAR = jl.Lidar(
     wavelength=(532.0, 1064.0, 1550.0), divergence=5.0, pulse=jl.GaussianPulse(fwhm=4.0), aperture=0.2
 )

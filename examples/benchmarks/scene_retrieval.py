@@ -18,7 +18,7 @@ import inversion
 import jaxlidar as jl
 
 TITLE = "One scene from many records"
-QUICK = {"footprints": 9, "shots": 50, "track": 20, "edge": 2.0}
+QUICK = {"footprints": 9, "shots": 50, "track": 10, "edge": 2.0, "max_steps": 2}
 SIDE, LAYERS, NOISE = 60, 25, 0.02
 # Width of the strip of terrain along a track of footprints, m.
 WIDTH = 60.0
@@ -122,7 +122,7 @@ def leaf_errors(fit, lad: np.ndarray) -> dict:
     }
 
 
-def wide_footprints(shots: int, edge: float) -> list[dict]:
+def wide_footprints(shots: int, edge: float, max_steps: int) -> list[dict]:
     """Retrieve stands from footprints of 25 m, with several priors."""
     lidar = jl.Lidar(wavelength=1064.0, altitude=1000.0, divergence=25.0, pulse=jl.GaussianPulse(4.0))
     x = np.linspace(2.0, SIDE - 2.0, round(np.sqrt(shots)))
@@ -141,7 +141,7 @@ def wide_footprints(shots: int, edge: float) -> list[dict]:
         records = observe(survey, scene)
         for label, unknown in priors.items():
             # Clumps are settled by their prior, and need no early stopping but more steps.
-            settings = {} if label == "Markov field" else {"held_out": 0.0, "max_steps": 60}
+            settings = {} if label == "Markov field" else {"held_out": 0.0, "max_steps": max_steps}
             fit, row = retrieve(records, survey, scene, [unknown], **settings)
             rows.append({"stand": name, "prior": label, "edge": edge, **row, **leaf_errors(fit, lad)})
     return rows
@@ -275,16 +275,18 @@ def one_by_one(survey: jl.Survey, records: dict, n_layers: int) -> tuple[dict, i
     return {name: np.asarray(a) for name, a in fits.values.items()}, int(np.sum(~np.asarray(fits.converged)))
 
 
-def measure(footprints: int = 225, shots: int = 20_000, track: int = 200, edge: float = 1.0) -> dict:
+def measure(
+    footprints: int = 225, shots: int = 20_000, track: int = 200, edge: float = 1.0, max_steps: int = 60
+) -> dict:
     """Return the fits of wide `footprints`, of narrow `shots`, and of the terrain under a `track`.
 
-    `edge`: width of voxels in m; they are 1 m high.
+    - `edge`: width of voxels in m; they are 1 m high. - `max_steps`: of fits of clumps.
     """
     warnings.simplefilter("ignore", jl.OffMapWarning)
     # Voxels of leaves reach down to the lowest terrain; below the ground they are dark.
     warnings.simplefilter("ignore", jl.MisplacedCanopyWarning)
     return {
-        "footprints": wide_footprints(footprints, edge),
+        "footprints": wide_footprints(footprints, edge, max_steps),
         "narrow": narrow_shots(shots, edge),
         "terrain": terrain_track(track),
     }
