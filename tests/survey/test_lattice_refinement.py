@@ -262,7 +262,9 @@ def test_results_do_not_depend_on_which_shots_are_traced_together():
         for chunk in chunks
     )
     assert np.ptp(np.asarray(all_shots["error"])) > 0
-    np.testing.assert_allclose(all_shots["reflectance"][3:12], nine_shots["reflectance"], rtol=1e-3, atol=1e-6)
+    np.testing.assert_allclose(
+        all_shots["reflectance"][3:12], nine_shots["reflectance"], rtol=1e-3, atol=1e-6
+    )
     np.testing.assert_allclose(all_shots["error"][3:12], nine_shots["error"], rtol=1e-2, atol=1e-5)
 
 
