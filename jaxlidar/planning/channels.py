@@ -30,6 +30,12 @@ class MaterialOptics(NamedTuple):
     reflectance: Float[Array, "wavelengths"]
     transmittance: Float[Array, "wavelengths"] | None
 
+    @property
+    def transmits(self) -> bool:
+        """True unless the transmittance is zero at all wavelengths; a traced one may become positive."""
+        transmittance = None if self.transmittance is None else concrete(self.transmittance)
+        return self.transmittance is not None and (transmittance is None or bool(np.any(transmittance > 0)))
+
 
 class ScattererChannels(NamedTuple):
     """Numbered materials and channels. `surfaces` has the ground first, if there is one, then the plates."""
@@ -95,12 +101,9 @@ def number_channels(optics: list[MaterialOptics]) -> ScattererChannels:
         name = material_optics.name
         channels.append(f"{name}.R")
         reflection, transmission = len(channels) - 1, -1
-        if material_optics.transmittance is not None:
-            transmittance = concrete(material_optics.transmittance)
-            # A traced transmittance may become positive.
-            if transmittance is None or np.any(transmittance > 0):
-                channels.append(f"{name}.T")
-                transmission = len(channels) - 1
+        if material_optics.transmits:
+            channels.append(f"{name}.T")
+            transmission = len(channels) - 1
         scatterers[name] = Scatterer(material, reflection, transmission)
     surfaces = tuple(s for name, s in scatterers.items() if name not in ("leaf", "bark"))
     return ScattererChannels(

@@ -113,6 +113,7 @@ def scattered_again(scene: Scene, optics: list[MaterialOptics], xp: Any = np) ->
     1. The least recollision probability times the largest albedo.
     2. A canopy: the decay of the slowest diffusion mode; ground that reflects makes its slab deeper.
     3. Between two surfaces, or of a mesh with itself: the root of the product of their reflectances.
+    4. Within a mesh that transmits, such as leaves: the least recollision probability times its albedo.
 
     q is the largest of these, and at most 1. `xp`: jax.numpy for values that a JAX transformation traces.
     """
@@ -125,7 +126,7 @@ def _number(x: Any, xp: Any) -> Any:
 
 
 def slowest_decay(scene: Scene, optics: list[MaterialOptics], xp: Any = np) -> Any:
-    """Estimate the ratio of successive orders in the slowest mode: steps 2 and 3 of `scattered_again`.
+    """Estimate the ratio of successive orders in the slowest mode: steps 2 to 4 of `scattered_again`.
 
     Zero for a canopy of an optical depth of at most one, which diffusion does not describe.
     """
@@ -140,6 +141,9 @@ def slowest_decay(scene: Scene, optics: list[MaterialOptics], xp: Any = np) -> A
     if len(surfaces) > 1:
         reflectances = xp.stack([xp.asarray(_largest_reflectance(optics, name, xp)) for name in surfaces])
         fraction = xp.maximum(fraction, xp.sqrt(xp.prod(xp.sort(reflectances)[-2:])))
+    leaves = [o for o in optics if o.name.startswith("mesh") and o.transmits]
+    if leaves:
+        fraction = xp.maximum(fraction, MIN_RECOLLISION * largest_albedo(leaves, xp))
     return _number(xp.minimum(fraction, 1.0), xp)
 
 

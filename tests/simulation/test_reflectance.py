@@ -256,3 +256,17 @@ def test_the_hot_spot_of_any_angles():
     assert float(jax.jit(factor)(BESIDE, PLACE)) == pytest.approx(beside, rel=1e-5)
     by_vmap = jax.vmap(lambda zenith: factor((zenith, 100.0), PLACE))(jnp.array([30.0, 31.0]))
     np.testing.assert_allclose(by_vmap, [eager, beside], rtol=1e-5)
+
+
+@pytest.mark.slow
+def test_light_among_leaves_of_two_kinds_is_followed_to_the_stated_accuracy():
+    """Histories of five channels have room for 12 orders; leaves of an albedo of 0.9 call for 30."""
+    voxels = jl.VoxelMap.from_lad(np.full((2, 2, 2), 1.5), voxel_size=1.0)
+    leaves = [
+        jl.leaf_mesh(voxels, 0.02, key=jax.random.key(seed), leaf=jl.LeafOptics(0.49, 0.41))
+        for seed in range(2)
+    ]
+    ground = jl.Terrain(np.zeros((2, 2)), 1.5, origin=(-0.5, -0.5), reflectance=0.2, sides="periodic")
+    options = {"sun": (30.0, 0.0), "view": (10.0, 90.0), "wavelengths": 865.0, "n_photons": 4096}
+    factor = jl.reflectance_factor(jl.Scene(meshes=leaves, ground=ground), key=KEY, **options)
+    assert factor.unfollowed[0] < 1e-3
