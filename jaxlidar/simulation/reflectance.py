@@ -427,6 +427,11 @@ def _make_plan(
         max_flight = max(max_flight, lengths.longest_flight(longest))
         max_faces = max(max_faces, size_bucket(lengths.voxels_along(height / sun_cosine)))
         max_faces = max(max_faces, size_bucket(lengths.max_faces(longest)))
+        if scene.canopy.sides == "periodic":
+            # A wide area under a low sensor has rays that start farther above the canopy than flights may be
+            # long.
+            max_flight += start
+            max_faces = max(max_faces, size_bucket(lengths.voxels_along(max_flight)))
     # Light that is not followed is in the result, whatever the albedo.
     plan = dataclasses.replace(plan, scope=dataclasses.replace(plan.scope, albedo=1.0))
     plan = plan.with_limits(start_distance=start, max_flight=max_flight)

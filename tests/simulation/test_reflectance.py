@@ -258,6 +258,18 @@ def test_the_hot_spot_of_any_angles():
     np.testing.assert_allclose(by_vmap, [eager, beside], rtol=1e-5)
 
 
+def test_a_periodic_slab_is_the_same_in_a_wide_area():
+    """Rays start some 5 km before they meet it, at the zenith angle 80 degrees."""
+    options = {"sun": (30.0, 0.0), "view": (80.0, 90.0), "wavelengths": 865.0, "n_photons": 8192}
+    scene = slab(1.0, jl.LeafOptics(0.4, 0.4), 0.2, shape=(40, 40, 1))
+    narrow, wide = (
+        jl.reflectance_factor(scene, key=KEY, area=((-half, -half), (half, half)), **options)
+        for half in (10.0, 200.0)
+    )
+    error = np.hypot(narrow.stderr[0], wide.stderr[0])
+    assert abs(wide.reflectance[0] - narrow.reflectance[0]) < 4 * error
+
+
 @pytest.mark.slow
 def test_light_among_leaves_of_two_kinds_is_followed_to_the_stated_accuracy():
     """Histories of five channels have room for 12 orders; leaves of an albedo of 0.9 call for 30."""
