@@ -16,6 +16,7 @@ RESULTS = FOLDER / "results"
 # The order of the page: exact references first, then other codes, measurements and records.
 ORDER = (
     *("mpmath_plate", "prosail_leaves", "discrete_ordinates", "rami4pilps"),
+    "rami_reflectance",
     *("mitransient_crown", "mitransient_meshes", "mcx_crown"),
     *("leaf_databases", "recorded_gedi", "recorded_posterior", "recorded_neon", "recorded_riegl"),
     *("recorded_flat", "recorded_lvis", "recorded_clouds", "recorded_photons"),
@@ -73,6 +74,14 @@ def costs(record: dict) -> tuple[str, ...]:
     return text, table(record["costs"], columns)
 
 
+def own_table(record: dict) -> tuple[str, ...]:
+    """Return the table that a script has written into its record, with its text."""
+    if "table" not in record:
+        return ()
+    own = record["table"]
+    return " ".join(own["text"].split()), table(own["headings"], own["lines"])
+
+
 def section(script: str, record: dict) -> str:
     """Return the section of one script: figure, caption, costs, and properties that remain unchecked."""
     software = ", ".join(f"{name} {version}" for name, version in record["versions"].items())
@@ -83,6 +92,7 @@ def section(script: str, record: dict) -> str:
         f"![{record['title']}](results/{script}.png)",
         record["seen"],
         *costs(record),
+        *own_table(record),
         f"Unchecked: {record['unchecked']}",
         f"{record['date']}, {software}, jax {record['machine']['jax']}, "
         f"Python {record['machine']['python']}{code}.",

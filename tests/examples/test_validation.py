@@ -8,6 +8,8 @@ import sys
 from pathlib import Path
 from types import SimpleNamespace
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -16,7 +18,7 @@ SCRIPTS = sorted(
     p.stem for p in FOLDER.glob("*.py") if not p.stem.startswith("_") and p.stem != "make_readme"
 )
 # Modules in the folders of examples: a name may stand for several files, so imports must not be kept.
-EXAMPLE_MODULES = (*("_common", "_crown", "_validation", "_waveforms", "peers", "simulation_cost"),)
+EXAMPLE_MODULES = (*("_common", "_crown", "_rami", "_validation", "_waveforms", "peers", "simulation_cost"),)
 
 
 @pytest.fixture
@@ -128,6 +130,50 @@ def test_open_forests(run, shared):
     for row in record["rows"]:
         most = 0.01 + (2 * row["arrangements_apart"] if row["zenith"] == 83 else 0.0)
         assert abs(row["difference"]) < most, row
+
+
+@pytest.fixture
+def rami(monkeypatch):
+    """Return the module of the canopies of RAMI."""
+    monkeypatch.syspath_prepend(str(FOLDER))
+    monkeypatch.delitem(sys.modules, "_rami", raising=False)
+    yield importlib.import_module("_rami")
+    sys.modules.pop("_rami", None)
+
+
+def few_discs(rami, radius, ground=0.159):
+    """Return a canopy of 400 discs in a sphere, repeated every 20 m."""
+    normal = rami.sphere(1.0, 3).draw(400)
+    discs = np.column_stack([np.full(400, radius), rami.sphere(5.0).draw(400), normal])
+    cloud = rami.Cloud(discs, np.array([[0.0, 0.0, 8.0]]), 0.5, 0.4, rami.sphere(5.0))
+    return rami.Forest((cloud,), ground, 20.0, 20.0, 15.0, True, 15.0)
+
+
+def test_triangles_and_voxels_have_the_area_of_their_discs(rami):
+    forest = few_discs(rami, 0.3)
+    (cloud,), leaf_area = forest.clouds, 400 * np.pi * 0.3**2
+    vertices, faces = rami.polygons(cloud.discs)
+    first, *others = np.moveaxis(vertices[faces], 1, 0)
+    area = 0.5 * np.linalg.norm(np.cross(others[0] - first, others[1] - first), axis=1)
+    np.testing.assert_allclose(area.sum(), leaf_area, rtol=1e-12)
+    for even in (False, True):
+        lad = rami.density(cloud, forest, 0.5, even)
+        np.testing.assert_allclose(lad.sum() * 0.5**3, leaf_area, rtol=1e-5)
+
+
+def test_scattering_by_leaves_is_normalised_and_sampled_from_its_density(rami):
+    scattering = rami.LeafScattering(0.45, 0.30)
+    cosine = np.linspace(-1.0, 1.0, 20_001)
+    density = 2 * scattering._factor(cosine, 0.4, np)
+    integral = np.trapezoid(density, cosine)
+    assert integral == pytest.approx(1.0, abs=1e-6)
+    u, v = jax.random.uniform(jax.random.key(0), (2, 40_000))
+    down = tuple(jnp.full(u.shape, x) for x in (0.0, 0.0, -1.0))
+    drawn = -np.asarray(scattering.sample(down, u, v)[2])
+    for power in (1, 2):
+        expected = np.trapezoid(density * cosine**power, cosine)
+        z = (np.mean(drawn**power) - expected) / (np.std(drawn**power) / np.sqrt(len(u)))
+        assert abs(z) < 4
 
 
 def skip_without(package):
