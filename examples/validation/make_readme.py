@@ -16,7 +16,7 @@ RESULTS = FOLDER / "results"
 # The order of the page: exact references first, then other codes, measurements and records.
 ORDER = (
     *("mpmath_plate", "prosail_leaves", "discrete_ordinates", "rami4pilps"),
-    "rami_reflectance",
+    *("rami_reflectance", "rami_waveforms"),
     *("mitransient_crown", "mitransient_meshes", "mcx_crown"),
     *("leaf_databases", "recorded_gedi", "recorded_posterior", "recorded_neon", "recorded_riegl"),
     *("recorded_flat", "recorded_lvis", "recorded_clouds", "recorded_photons"),

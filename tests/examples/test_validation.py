@@ -176,6 +176,23 @@ def test_scattering_by_leaves_is_normalised_and_sampled_from_its_density(rami):
         assert abs(z) < 4
 
 
+@pytest.mark.slow
+def test_waveforms_over_discs(run):
+    """In all: of so few discs, heights are blurred by the bins of the tracer."""
+
+    def plant(module, factor=1.0):
+        forest = few_discs(sys.modules["_rami"], 0.5)
+        module.read_forest, module.SIZES, exact = lambda *_: forest, (), module.exact_first_order
+        brighter = forest.clouds[0]._replace(reflectance=0.5 * factor)
+        module.exact_first_order = lambda _, *rest: exact(forest._replace(clouds=(brighter,)), *rest)
+        module.DIAMETER = 10.0
+
+    few = ("folder", "--photons", "4096", "--canopies", "1")
+    assert holds(run("rami_waveforms", *few, planted=plant), "in all")
+    wrong = run("rami_waveforms", *few, planted=lambda module: plant(module, 1.1))
+    assert not holds(wrong, "in all")
+
+
 def skip_without(package):
     """Skip the test if a package is missing."""
     # Not imported: mitransient refuses to be, before its script has chosen a variant of Mitsuba.
