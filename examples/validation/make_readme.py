@@ -79,7 +79,8 @@ def own_table(record: dict) -> tuple[str, ...]:
     if "table" not in record:
         return ()
     own = record["table"]
-    return " ".join(own["text"].split()), table(own["headings"], own["lines"])
+    columns = {heading: lambda line, i=i: line[i] for i, heading in enumerate(own["headings"])}
+    return " ".join(own["text"].split()), table(own["lines"], columns)
 
 
 def section(script: str, record: dict) -> str:
