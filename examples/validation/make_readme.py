@@ -17,7 +17,7 @@ RESULTS = FOLDER / "results"
 ORDER = (
     *("mpmath_plate", "prosail_leaves", "discrete_ordinates", "rami4pilps"),
     *("rami_reflectance", "rami_waveforms"),
-    *("mitransient_crown", "mitransient_meshes", "mcx_crown"),
+    *("mitransient_crown", "mitransient_meshes", "mcx_crown", "standard_errors"),
     *("leaf_databases", "recorded_gedi", "recorded_posterior", "recorded_neon", "recorded_riegl"),
     *("recorded_flat", "recorded_lvis", "recorded_clouds", "recorded_photons"),
 )

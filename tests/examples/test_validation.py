@@ -18,7 +18,10 @@ SCRIPTS = sorted(
     p.stem for p in FOLDER.glob("*.py") if not p.stem.startswith("_") and p.stem != "make_readme"
 )
 # Modules in the folders of examples: a name may stand for several files, so imports must not be kept.
-EXAMPLE_MODULES = (*("_common", "_crown", "_rami", "_validation", "_waveforms", "peers", "simulation_cost"),)
+EXAMPLE_MODULES = (
+    *("_common", "_crown", "_rami", "_validation", "_waveforms", "peers", "simulation_cost"),
+    "surveys",
+)
 
 
 @pytest.fixture
@@ -316,3 +319,25 @@ def test_recorded_photons_of_icesat2(run, shared):
         module.read_atl03 = lambda path: dataclasses.replace(read(path), height=read(path).height + 2.0)
 
     assert not holds(run("recorded_photons", *paths, planted=plant), "ground")
+
+
+@pytest.mark.slow
+def test_standard_errors_are_those_of_scatter(run):
+    """Energy budgets, of which eight keys tell little; planted: errors of half the size."""
+
+    def one_case(factor: float):
+        def plant(module):
+            make = module.CASES["energy budget of a waveform"]
+
+            def planted():
+                estimate = make()
+                return lambda key: tuple(a * f for a, f in zip(estimate(key), (1.0, factor)))
+
+            module.CASES = {"energy budget of a waveform": planted}
+            module.fitted_profiles = lambda keys: np.ones((keys, 1))
+
+        return plant
+
+    right, wrong = (run("standard_errors", "--keys", "24", planted=one_case(f)) for f in (1.0, 0.5))
+    assert 0.8 < right["rows"][0]["here"] < 1.25
+    assert wrong["rows"][0]["here"] > 1.6
