@@ -43,8 +43,10 @@ from jaxlidar.scenes.terrain import Terrain
 SOLID_OPTICAL_DEPTH = 40.0
 # Faces that differ by less than this fraction of an edge are the same.
 _FACE_TOLERANCE = 1e-6
-# Points along each horizontal edge of a voxel that is turned, and bytes of a voxel while maps are joined.
-_POINTS, _BYTES_PER_VOXEL = 8, 40.0
+# Points along the horizontal edges of voxels, where a map is turned, and how many are turned together.
+_POINTS, _POINTS_AT_ONCE = 8, 2**21
+# Bytes of a voxel while maps are joined.
+_BYTES_PER_VOXEL = 40.0
 
 
 # Numbers, arrays or nested sequences of numbers.
@@ -333,8 +335,9 @@ class VoxelMap(eqx.Module):
         Extinction times volume is what is divided among voxels, so that the leaf and bark areas of all maps
         are conserved; where maps overlap, areas add up. A map that is not turned is divided by the volumes
         that voxels share: one with the same voxels in the same places stays as it is. A turned one is divided
-        by 8 x 8 points of each voxel. Wood that fills a voxel, with a probability of one, is spread like
-        leaves: where it must stop light, join maps of the same voxels.
+        by points, 8 or more along the horizontal edges of its voxels and of those of the result. Wood that
+        fills a voxel, with a probability of one, is spread like leaves: where it must stop light, join maps
+        of the same voxels.
 
         **Arguments:**
 
@@ -451,21 +454,33 @@ class _Place(NamedTuple):
         if self.turn % 360.0 == 0.0:
             columns = scipy.sparse.kron(*(_shares(faces[k], origin[k], size[k], shape[k]) for k in range(2)))
         else:
-            # Points in each column, as fractions of its edges.
-            point = (np.arange(_POINTS) + 0.5) / _POINTS
-            x, y = (self.size[k] * np.add.outer(np.arange((nx, ny)[k]), point) for k in range(2))
-            places = np.stack(np.broadcast_arrays(x[:, None, :, None], y[None, :, None, :]), axis=-1)
-            places = self.origin[:2] + _turned(places.reshape(-1, 2), self.turn)
-            # Rounding may put a point at a face just outside.
-            target = np.floor((places - origin[:2]) / size[:2]).astype(int)
-            i, j = np.clip(target, 0, np.array(shape[:2]) - 1).T
-            target = i * shape[1] + j
-            source = np.repeat(np.arange(nx * ny), _POINTS**2)
-            weights = np.full(len(target), 1.0 / _POINTS**2)
-            columns = scipy.sparse.coo_array((weights, (target, source)), (shape[0] * shape[1], nx * ny))
+            columns = self._turned_shares(origin[:2], size[:2], shape[:2])
         amount = extinction.reshape(nx * ny, nz).astype(float) * self.size.prod()
         amount = columns.tocsr() @ (layers.tocsr() @ amount.T).T
         return amount.reshape(shape) / size.prod()
+
+    def _turned_shares(
+        self, origin: Float[np.ndarray, "2"], size: Float[np.ndarray, "2"], shape: tuple[int, int]
+    ) -> scipy.sparse.csr_array:
+        """Return the share of each column of turned voxels in each column of another grid, by points."""
+        nx, ny, _ = self.shape
+        # As many along an edge as leave no column of the other grid without a point.
+        counts = np.ceil(_POINTS * np.maximum(self.size[:2] / size.min(), 1.0)).astype(int).tolist()
+        x, y = (d / c * (np.arange(n * c) + 0.5) for d, c, n in zip(self.size, counts, (nx, ny)))
+        column_of_y = np.arange(len(y)) // counts[1]
+        shares = scipy.sparse.csr_array((shape[0] * shape[1], nx * ny))
+        rows = -(-_POINTS_AT_ONCE // len(y))
+        for first in range(0, len(x), rows):
+            row = np.arange(first, min(first + rows, len(x)))
+            places = np.stack(np.meshgrid(x[row], y, indexing="ij"), axis=-1).reshape(-1, 2)
+            places = self.origin[:2] + _turned(places, self.turn)
+            # Rounding may put a point at a face just outside.
+            target = np.floor((places - origin) / size).astype(int)
+            i, j = np.clip(target, 0, np.array(shape) - 1).T
+            source = np.add.outer(row // counts[0] * ny, column_of_y).ravel()
+            weights = np.full(len(source), 1.0 / (counts[0] * counts[1]))
+            shares += scipy.sparse.coo_array((weights, (i * shape[1] + j, source)), shares.shape).tocsr()
+        return shares
 
 
 def _turned(points: Float[np.ndarray, "n 2"], azimuth: float) -> Float[np.ndarray, "n 2"]:

@@ -79,16 +79,16 @@ def test_a_quarter_turn_is_exact():
     np.testing.assert_allclose(turned.leaf, np.rot90(np.asarray(voxels.leaf), -1), rtol=1e-5)
 
 
-def test_voxels_within_a_turned_map_keep_their_density():
-    """Planted: points that fall into too few voxels leave holes."""
-    even = jl.VoxelMap.from_lad(np.ones((30, 30, 2)), voxel_size=1.0)
-    turned = jl.VoxelMap.join([even], azimuth=20.0)
-    middle = np.round(moments(turned, "leaf")[1] - np.asarray(turned.origin)).astype(int)
-    around = (slice(m - 6, m + 7) for m in middle[:2])
+@pytest.mark.parametrize("size", [1.0, (0.6, 0.25, 1.0), 0.1, 2.0])
+def test_voxels_within_a_turned_map_keep_their_density(monkeypatch, size):
+    """In small and large voxels; planted: 8 points along edges of 1 m leave holes between voxels of 0.1 m."""
+    monkeypatch.setattr("jaxlidar.scenes.voxels._POINTS_AT_ONCE", 10_000)
+    even = jl.VoxelMap.from_lad(np.ones((20, 20, 2)), voxel_size=1.0)
+    turned = jl.VoxelMap.join([even], size, azimuth=20.0)
+    middle = (moments(turned, "leaf")[1] - np.asarray(turned.origin)) / np.asarray(turned.voxel_size)
+    reach = 6.0 / np.asarray(turned.voxel_size)
+    around = (slice(int(m - r), int(m + r) + 1) for m, r in zip(middle[:2], reach))
     np.testing.assert_allclose(np.asarray(turned.leaf)[*around], 0.5, rtol=0.1)
-    # Smaller voxels than the points are apart would have holes.
-    finer = jl.VoxelMap.join([even], 0.05 + 1.0 / 8.0, azimuth=20.0)
-    np.testing.assert_allclose(float(finer.leaf.sum()) * 0.175**3, 0.5 * 30 * 30 * 2, rtol=1e-5)
 
 
 def test_a_scene_of_two_joined_plots_returns_the_light_of_both():
