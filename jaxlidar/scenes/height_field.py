@@ -236,7 +236,9 @@ class HeightField(AbstractShape):
         """Bound the height, m, by which rounding may put a ray under the surface."""
         field = self.heights
         extent = self.highest - self.lowest + field.spacing[0] + field.spacing[1]
-        size = extent + sum(jnp.abs(c) for c in x)
+        # Where a ray from a sensor meets the field, its height has the rounding of that, not of the start.
+        height = jnp.maximum(jnp.abs(self.lowest), jnp.abs(self.highest))
+        size = extent + height + sum(jnp.abs(c) for c in x)
         return _ROUNDING * float(jnp.finfo(x[2].dtype).eps) * size
 
     def _block_of(self, cell: Int[Array, "*s"], axis: int) -> tuple[Int[Array, "*s"], ...]:

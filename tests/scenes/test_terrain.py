@@ -125,6 +125,20 @@ SLOPE = np.tan(np.deg2rad(15.0))
 WIDE = jl.Lidar(altitude=1e5, divergence=0.02, pulse=jl.GaussianPulse(fwhm=4.0))
 
 
+@pytest.mark.parametrize("heights", [np.zeros_like(HILLS), np.maximum(HILLS, 0.0)], ids=["plain", "lake"])
+@pytest.mark.parametrize("depth", [30.0, 300.0, 3000.0])
+def test_level_terrain_far_below_a_sensor_is_met(heights, depth):
+    """Also where it is the lowest; planted: a tolerance of the start's rounding, not of the terrain's."""
+    random, below = np.random.default_rng(5), depth + 1.0 / 3.0
+    start = np.column_stack([random.uniform(2.0, 14.0, (500, 2)), np.zeros(500)])
+    tilt = random.uniform(-1.0, 1.0, (500, 2)) / below
+    direction = np.column_stack([tilt, -np.sqrt(1.0 - np.sum(tilt**2, axis=1))])
+    shape = hills(heights=heights - below, origin=(0.0, 0.0)).shape
+    distance = np.asarray(distances(shape, *(vec(jnp.asarray(a.T)) for a in (start, direction))))
+    point = start + distance[:, None] * direction
+    np.testing.assert_allclose(point[:, 2], height_of(heights, point[:, :2]) - below, atol=1e-6 * below)
+
+
 def test_terrain_in_a_plane_is_traced_as_a_plane():
     flat = jl.Terrain(SLOPE * X + 3.0, 1.0, (-10.0, -8.0), 0.4)
     ground = jl.Ground(SLOPE * 10.0 + 3.0, 0.4, slope=15.0, aspect=270.0)
