@@ -272,12 +272,14 @@ class ShotAxes(NamedTuple):
 
     - `origin`: (shots, 3) m, where the axis is at time zero: on the reference plane, or at the sensor of a
       lidar that is placed by it. - `direction`: (shots, 3) unit vectors.
-    - `distance`: (shots,) m from the sensor to the origin.
+    - `distance`: (shots,) m from the sensor to the origin; of a lidar that is placed by its sensor the error
+      of the range. - `begins_at_sensor`: True of such a lidar.
     """
 
     origin: Float[np.ndarray, "shots 3"]
     direction: Float[np.ndarray, "shots 3"]
     distance: Float[np.ndarray, " shots"]
+    begins_at_sensor: bool
 
 
 def position_along_beam(
@@ -299,9 +301,8 @@ def _shot_axes(
     position, direction = np.asarray(position, float), beam_directions(zenith, azimuth)
     distance = np.asarray(range_at_time_zero, float)
     if position.shape[1] == 3:
-        # Zero, but for errors of measured ranges.
-        return ShotAxes(position + distance[:, None] * direction, direction, distance)
-    return ShotAxes(np.pad(position, ((0, 0), (0, 1))), direction, distance)
+        return ShotAxes(position + distance[:, None] * direction, direction, distance, True)
+    return ShotAxes(np.pad(position, ((0, 0), (0, 1))), direction, distance, False)
 
 
 # -- waveforms as input ------------------------------------------------------------------------------------
@@ -987,10 +988,9 @@ def _energy_per_reflectance(waves: DetectorInput, shots: slice) -> Float[np.ndar
     From an altitude, ranges hardly change over a record. From a sensor they begin at zero: the first sample
     that begins after the emission stands for those before it.
     """
-    distance = waves.axes.distance[shots, None]
-    if distance.all():
-        return waves.constant / distance**2
-    ranges = distance + 0.5 * SPEED_OF_LIGHT * np.maximum(waves.time, 0.5 * waves.step)
+    if not waves.axes.begins_at_sensor:
+        return waves.constant / waves.axes.distance[shots, None] ** 2
+    ranges = 0.5 * SPEED_OF_LIGHT * np.maximum(waves.time[None], 0.5 * waves.step)
     return waves.constant / ranges**2
 
 

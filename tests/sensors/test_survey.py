@@ -382,3 +382,22 @@ def test_strips_disagree_as_their_geometry_does(tmp_path):
     again = jl.rerun(tmp_path / "strips.zarr")
     np.testing.assert_array_equal(again.reflectance, many.reflectance)
     np.testing.assert_array_equal(again.acquisition.range_at_time_zero, true.stated[:, 5])
+
+
+def test_errors_of_ranges_leave_the_strength_of_returns():
+    """Over leaves, whose standard errors are thresholds; planted: the error of the range as the range."""
+    down = jl.Conical(half_angle=1e-7, frequency=1.0)
+    voxels = jl.VoxelMap.from_lad(np.full((4, 4, 2), 0.5), voxel_size=1.0, origin=(-2.0, -2.0, 1.0))
+    scene = jl.Scene(canopy=jl.Canopy(voxels, leaf=jl.LeafOptics(0.4, 0.4)), ground=jl.Ground())
+    flight = jl.Trajectory([0.0, 1.0], [(0, 0, 60), (0, 1, 60)])
+    stated = jl.Survey.fly(flight, down, lidar=DRONE, pulse_rate=2)
+    options = {"key": jax.random.key(0), "max_orders": 1, "rtol": 0.05}
+    true = stated.disturbed(range=0.01, key=jax.random.key(1))
+    many = [jl.simulate_many(survey, scene, **options) for survey in (stated, true)]
+    assert many[0].stderr.any()
+    returns, with_errors = (waves.returns(detector="peak") for waves in many)
+    assert len(returns) > len(stated)
+    np.testing.assert_array_equal(with_errors.shot, returns.shot)
+    np.testing.assert_allclose(with_errors.reflectance, returns.reflectance, rtol=2e-3)
+    error = true.stated[returns.shot, 5]
+    np.testing.assert_allclose(with_errors.range - returns.range, error, atol=1e-6)
