@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from jaxlidar._fields.checks import (
     array_namespace,
@@ -681,8 +681,8 @@ def check_footprints_on_terrain(shots: Lidar | Survey, scene: Scene) -> None:
         return
     terrain: Any = scene.ground
     rims, (origin, end) = _terrain_rims(survey), _extent(terrain, np)
-    for i in np.flatnonzero(_near_border(rims, survey, terrain, 0.0)[0]).tolist():
-        box, lowest, highest = _box_on_terrain(rims, survey, i, terrain)
+    near_border = np.flatnonzero(_near_border(rims, survey, terrain, 0.0)[0])
+    for i, box, lowest, highest in _boxes_on_terrain(rims, survey, near_border, terrain):
         if np.all(box[0] >= origin) and np.all(box[1] <= end):
             continue
         footprint = "the footprint" if len(survey) == 1 else f"the footprint of shot {i} of {len(survey)}"
@@ -708,8 +708,8 @@ def footprints_on_terrain(survey: Survey, scene: Scene, margin: float = 0.0) -> 
         rims, (origin, end) = _terrain_rims(survey), _extent(terrain, np)
         may_be_off, is_off = _near_border(rims, survey, terrain, margin)
         is_on = ~is_off
-        for i in np.flatnonzero(may_be_off & ~is_off).tolist():
-            box, _, _ = _box_on_terrain(rims, survey, i, terrain)
+        undecided = np.flatnonzero(may_be_off & ~is_off)
+        for i, box, _, _ in _boxes_on_terrain(rims, survey, undecided, terrain):
             is_on[i] = np.all(box[0] >= origin + margin) and np.all(box[1] <= end - margin)
     return is_on
 
@@ -747,16 +747,24 @@ def _near_border(
     return may_be_off, is_off
 
 
-def _box_on_terrain(
-    rims: FootprintRims, survey: Survey, shot: int, terrain: Terrain
-) -> tuple[Float[np.ndarray, "2 2"], float, float]:
-    """Return the extent of a footprint between the heights beneath its own rays, m, and these heights, m."""
-    # Coordinates about the aim point, as those of the rim.
-    position = survey.position[shot]
-    shape = terrain.moved(-position).shape
+def _boxes_on_terrain(
+    rims: FootprintRims, survey: Survey, shots: Int[np.ndarray, " n"], terrain: Terrain
+) -> Iterator[tuple[int, Float[np.ndarray, "2 2"], float, float]]:
+    """Yield shots, and the extents of their footprints between the heights beneath their own rays, m.
+
+    After the extent come these heights, the lowest and the highest, m.
+    """
+    if not shots.size:
+        return
+    # About the south-west corner: single precision has no digits for map coordinates. Converted once, as the
+    # whole terrain would be for each shot.
+    corner = concrete_array(terrain.origin)
+    shape = jax.tree.map(concrete_array, terrain.moved(-corner).shape)
     assert isinstance(shape, HeightField)
-    box, lowest, highest = shape.height_bounds_below(rims.points[shot], rims.rays[shot])
-    return box + position, lowest, highest
+    for i in shots.tolist():
+        points = rims.points[i] + np.append(survey.position[i] - corner, 0.0)
+        box, lowest, highest = shape.height_bounds_below(points, rims.rays[i])
+        yield i, box + corner, lowest, highest
 
 
 def _terrain_rims(survey: Survey) -> FootprintRims:
