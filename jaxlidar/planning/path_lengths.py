@@ -764,7 +764,7 @@ def _boxes_on_terrain(
     for i in shots.tolist():
         points = rims.points[i] + np.append(survey.position[i] - corner, 0.0)
         box, lowest, highest = shape.height_bounds_below(points, rims.rays[i])
-        yield i, box + corner, lowest, highest
+        yield i, np.asarray(box) + corner, lowest, highest
 
 
 def _terrain_rims(survey: Survey) -> FootprintRims:
