@@ -36,6 +36,7 @@ def read_inventory(path: str | os.PathLike[str], *, crs: str | int | None = None
     >>> inventory.species, inventory.height.tolist(), inventory.diameter.tolist()
     (('beech', 'oak'), [21.4, 18.0], [0.35000000000000003, nan])
     """
+    system = crs_name(crs)
     path, lines = read_lines(path)
     if not lines or not lines[0].strip():
         raise ValueError(f"{path}: line 1: there is no line that names the columns")
@@ -49,6 +50,6 @@ def read_inventory(path: str | os.PathLike[str], *, crs: str | int | None = None
     columns = {name: [row[i] for row in rows] for i, name in enumerate(names)}
     place_of = [f"{path}: line {number}" for number in numbers]
     try:
-        return inventory_of_table(columns, place_of.__getitem__)._replace(crs=crs_name(crs))
+        return inventory_of_table(columns, place_of.__getitem__)._replace(crs=system)
     except ValueError as error:
         raise error if str(error).startswith(str(path)) else ValueError(f"{path}: line 1: {error}") from None

@@ -79,6 +79,11 @@ def test_a_system_travels_from_files_to_results(files, tmp_path):
             returns.to_las(file)
 
 
+def test_a_wrong_system_of_an_inventory_is_no_fault_of_its_file(files):
+    with pytest.raises(ValueError, match=r"^crs = 'EPSG:4326' is not in metres"):
+        jl.io.read_inventory(files / "trees.csv", crs="EPSG:4326")
+
+
 def test_trees_and_their_leaves_are_in_the_system_of_the_inventory(files):
     inventory = jl.io.read_inventory(files / "trees.csv", crs=25832)
     stand = jl.stand_from_inventory(inventory, jl.shrub(), individuals=1)
