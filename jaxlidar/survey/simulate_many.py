@@ -131,7 +131,7 @@ def simulate_many(
       Default None: all.
     - `beyond`: "miss" leaves shots off the scene empty: those whose footprints are not on its open terrain.
       Their waveforms, standard errors and photons are zero, their `ground_position` and truth NaN; the others
-      are those of `survey.within(scene)`. Default "refuse": such shots are refused.
+      are those of `survey.within(scene)`, and there must be one. Default "refuse": such shots are refused.
 
     **Returns:** a `Waveforms`.
 

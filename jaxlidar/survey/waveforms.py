@@ -138,7 +138,8 @@ class Waveforms(eqx.Module):
         """Positions (shots, 3), m, where the beam axes meet the ground; NaN where they meet none.
 
         They follow from `ground_height` and the axes. An exactly level axis has no single point at that
-        height, and is NaN, too.
+        height, and is NaN, too. Of a survey that is disturbed, they are the points of the stated axes at the
+        heights that the true ones meet.
         """
         direction, height = self.direction, np.asarray(self.ground_height, float)
         start = np.asarray(self.position, float)
