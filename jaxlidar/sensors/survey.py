@@ -345,10 +345,10 @@ class Survey(eqx.Module):
 
         Light goes where the true geometry leads, which is that of the survey that is returned. Results have
         the stated geometry, which is that of this survey: positions of returns, files, and
-        `Waveforms.position`. Errors of position and attitude are drawn for each flight line and stay the same
-        along it; those of ranges, for each shot. With the rotation R(a) of the platform at the attitude a,
-        the error e of that, the boresight error B and the position error d, a stated beam w of the sensor s
-        travels along R(a + e) B R(a)^T w from s + d.
+        `Waveforms.position`. Errors of position and attitude are drawn for each number of a flight line and
+        stay the same along it; those of ranges, for each shot. With the rotation R(a) of the platform at the
+        attitude a, the error e of that, the boresight error B and the position error d, a stated beam w of
+        the sensor s travels along R(a + e) B R(a)^T w from s + d.
 
         **Arguments:**
 
@@ -397,11 +397,13 @@ class Survey(eqx.Module):
         range_error = np.zeros(shots)
         if key is not None:
             check_key(key)
-            random = np.random.default_rng(np.asarray(jax.random.bits(key, (8,), np.uint32)))
+            seed = np.asarray(jax.random.bits(key, (8,), np.uint32))
+            of_lines, of_shots = np.random.default_rng(seed).spawn(2)
+            # By the number of the line: it has the same errors whichever other lines there are.
             lines = np.zeros(shots, int) if self.flight_line is None else self.flight_line
-            line, n_lines = np.unique(lines, return_inverse=True)[1], len(np.unique(lines))
-            error = {name: (d * random.normal(size=(n_lines, 3)))[line] for name, d in deviations.items()}
-            range_error = float(range) * random.normal(size=shots)
+            draws = of_lines.normal(size=(lines.max() + 1, len(deviations), 3))[lines]
+            error = {name: d * draws[:, i] for i, (name, d) in enumerate(deviations.items())}
+            range_error = float(range) * of_shots.normal(size=shots)
         zenith, azimuth = self.zenith, self.azimuth
         if turns:
             assert self.attitude is not None

@@ -401,3 +401,15 @@ def test_errors_of_ranges_leave_the_strength_of_returns():
     np.testing.assert_allclose(with_errors.reflectance, returns.reflectance, rtol=2e-3)
     error = true.stated[returns.shot, 5]
     np.testing.assert_allclose(with_errors.range - returns.range, error, atol=1e-6)
+
+
+def test_a_flight_line_has_its_errors_whichever_others_there_are():
+    """Planted: errors by the order of lines, by which strips that are disturbed one by one would be alike."""
+    stated, key = strips(((0, 0), (0, 50)), ((20, 50), (20, 0))), jax.random.key(7)
+    options = {"position": 0.1, "attitude": 0.02, "key": key}
+    true = stated.disturbed(**options)
+    second = np.flatnonzero(stated.flight_line == 2)
+    alone = stated.subset(second).disturbed(**options)
+    np.testing.assert_array_equal(alone.sensor, true.sensor[second])
+    np.testing.assert_allclose(alone.direction, true.direction[second], atol=1e-12)
+    assert not np.isclose(alone.sensor[0] - stated.sensor[second[0]], true.sensor[0] - stated.sensor[0]).any()
