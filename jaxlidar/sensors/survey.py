@@ -410,7 +410,7 @@ class Survey(eqx.Module):
             in_body = np.einsum("sji,sj->si", body_rotation(*self.attitude.T), self.direction)
             true_rotation = body_rotation(*(self.attitude + error["attitude"]).T)
             direction = np.einsum("sij,jk,sk->si", true_rotation, rotation_matrix(*turn), in_body)
-            zenith, azimuth = _angles_of(direction)
+            zenith, azimuth = beam_angles(direction)
         stated = self.stated_rows
         stated[:, 5] += range_error
         names = (*_OPTIONAL_ROWS, "flight_line")
@@ -698,11 +698,10 @@ def _lifted(flight: Trajectory, terrain: Any) -> Trajectory:
     """Return a trajectory whose heights are above a terrain as one whose heights are above z = 0."""
     if not callable(getattr(terrain, "height_at", None)):
         raise TypeError(f"above is a {type(terrain).__name__}; admissible is a Terrain, or None")
-    common_crs({"trajectory": flight.crs, "above": terrain.crs})
+    crs = common_crs({"trajectory": flight.crs, "above": getattr(terrain, "crs", None)})
     ground = np.asarray(terrain.height_at(flight.position[:, 0], flight.position[:, 1]), float)
-    return eqx.tree_at(
-        lambda f: f.position, flight, flight.position + np.pad(ground[:, None], ((0, 0), (2, 0)))
-    )
+    lifted = flight.position + np.pad(ground[:, None], ((0, 0), (2, 0)))
+    return dataclasses.replace(flight, position=lifted, crs=crs)
 
 
 def _strip(
@@ -727,7 +726,7 @@ def _strip(
     if lever_arm is not None:
         sensor = sensor + turn @ lever_arm
     east, north, up = direction.T
-    zenith, azimuth = _angles_of(direction)
+    zenith, azimuth = beam_angles(direction)
     # Positive to the right of the platform's heading.
     yaw = np.deg2rad(flight.yaw)
     scan_angle = np.rad2deg(np.arctan2(east * np.cos(yaw) - north * np.sin(yaw), -up))
@@ -750,11 +749,13 @@ def _strip(
     return Survey(lidar, aim, np.minimum(zenith, MAX_ZENITH), azimuth, sensor[:, 2], **order)
 
 
-def _angles_of(direction: Float[np.ndarray, "shots 3"]) -> tuple[np.ndarray, np.ndarray]:
+def beam_angles(direction: Float[np.ndarray, "shots 3"]) -> tuple[np.ndarray, np.ndarray]:
     """Return the zenith and azimuth in degrees of unit vectors, the inverse of `beam_directions`."""
     east, north, up = direction.T
     sine = np.hypot(east, north)
-    azimuth = np.where(sine > 0, np.rad2deg(np.arctan2(east, north)) % 360.0, 0.0)
+    azimuth = np.rad2deg(np.arctan2(east, north)) % 360.0
+    # A remainder of a small negative angle is rounded to 360.
+    azimuth = np.where((sine > 0) & (azimuth < 360.0), azimuth, 0.0)
     return np.rad2deg(np.arctan2(sine, -up)), azimuth
 
 

@@ -11,6 +11,7 @@ import pytest
 import scipy.stats
 
 import jaxlidar as jl
+from jaxlidar.sensors.survey import beam_angles
 
 LINE = {"start": (100.0, 50.0), "end": (160.0, 130.0), "speed": 20.0, "pulse_rate": 400.0}
 # Unit vectors along this line and to its right.
@@ -413,3 +414,18 @@ def test_a_flight_line_has_its_errors_whichever_others_there_are():
     np.testing.assert_array_equal(alone.sensor, true.sensor[second])
     np.testing.assert_allclose(alone.direction, true.direction[second], atol=1e-12)
     assert not np.isclose(alone.sensor[0] - stated.sensor[second[0]], true.sensor[0] - stated.sensor[0]).any()
+
+
+def test_a_flight_above_terrain_takes_its_crs():
+    terrain = jl.Terrain(np.zeros((12, 12)), 10.0, reflectance=0.3, crs=25832)
+    flight = jl.Trajectory([0.0, 1.0], [(20.0, 20.0, 60.0), (20.0, 60.0, 60.0)])
+    options = {"lidar": jl.Lidar(sensor=(0, 0, 0)), "above": terrain}
+    strip = jl.Survey.fly(flight, jl.Conical(half_angle=5.0, frequency=2.0), **options)
+    assert strip.crs == terrain.crs == "EPSG:25832"
+
+
+def test_azimuths_are_below_a_full_turn():
+    """A beam that is vertical but for rounding; planted: the remainder alone, which rounds up."""
+    almost_north = np.array([[-1e-30, 1.0, 0.0]])
+    assert np.rad2deg(np.arctan2(-1e-30, 1.0)) % 360.0 == 360.0
+    assert beam_angles(almost_north)[1][0] == 0.0
