@@ -11,7 +11,9 @@ import pytest
 import inversion
 import jaxlidar as jl
 from jaxlidar import UnitWarning
-from jaxlidar._fields.checks import MAGNITUDES
+from jaxlidar._fields.checks import Magnitude
+from jaxlidar.plants import habits
+from jaxlidar.sensors import scan, survey
 from tests.helpers import ask
 
 UNKNOWN = inversion.Unknown(lambda s: s.ground.reflectance, bounds=(0.0, 1.0))
@@ -97,7 +99,12 @@ def test_traced_values_are_not_warned_of():
 
 
 def test_likely_units_differ_from_the_unit():
-    for unit, low, high, factors in MAGNITUDES.values():
+    classes = filter(dataclasses.is_dataclass, vars(jl).values())
+    units = [field.metadata.get("unit") for kind in classes for field in dataclasses.fields(kind)]
+    units += [habits._HEIGHT, habits._DIAMETER, scan._HALF_ANGLE, survey._PULSE_RATE]
+    magnitudes = [unit for unit in units if isinstance(unit, Magnitude)]
+    assert len(magnitudes) > 20
+    for unit, low, high, factors in magnitudes:
         assert 0 <= low < high
         assert unit not in factors
         assert all(factor > 0 and factor != 1 for factor in factors.values())

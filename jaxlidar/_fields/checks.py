@@ -84,41 +84,19 @@ def as_numpy(x: Any, field: str = "value") -> Float[np.ndarray, "..."]:
     return np.asarray(x, dtype=float)
 
 
-def scalar(field: str) -> Callable[[ArrayLike], Float[Array, ""]]:
-    """Make the converter of a field that is one number: `as_scalar` with the field's name."""
-
-    def convert(x: ArrayLike) -> Float[Array, ""]:
-        return as_scalar(x, field)
-
-    return convert
+def as_optional_array(x: ArrayLike | Sequence | None, field: str = "value") -> Float[Array, "..."] | None:
+    """Convert to a floating-point JAX array; None stays None."""
+    return None if x is None else as_array(x, field)
 
 
-def optional_scalar(field: str) -> Callable[[ArrayLike | None], Float[Array, ""] | None]:
-    """Make the converter of a field that is one number or None."""
-
-    def convert(x: ArrayLike | None) -> Float[Array, ""] | None:
-        return as_optional_scalar(x, field)
-
-    return convert
-
-
-def array(field: str) -> Callable[[ArrayLike | Sequence], Float[Array, "..."]]:
-    """Make the converter of a field that is an array of numbers: `as_array` with the field's name."""
-
-    def convert(x: ArrayLike | Sequence) -> Float[Array, "..."]:
-        return as_array(x, field)
-
-    return convert
-
-
-def coordinates(field: str, size: int) -> Callable[[Any], Array | np.ndarray]:
+def coordinates(size: int) -> Callable[..., Array | np.ndarray]:
     """Make the converter of a field that is a position in m: a NumPy array of float64 unless it is traced.
 
     Map coordinates are millions of metres, which single precision resolves to 0.5 m only. They are kept in
     double precision, outside of JAX, until they are taken relative to a local origin.
     """
 
-    def convert(x: Any) -> Array | np.ndarray:
+    def convert(x: Any, field: str = "position") -> Array | np.ndarray:
         value = concrete(x)
         a = as_array(x, field) if value is None else value
         check_shape(field, a, (), (size,))
@@ -436,12 +414,13 @@ class UnitWarning(UserWarning):
 
 
 class Magnitude(NamedTuple):
-    """The unit of a field, the range of plausible values, and units that it is confused with.
+    """The unit of a quantity, its plausible values, and units that are given by mistake.
 
-    - `unit`: of the field.
-    - `low`, `high`: limits of the plausible values, in that unit.
-    - `confused_units`: for each unit that is given by mistake, its size in units of the field; the likelier
-      ones come first.
+    - `unit`: of the quantity.
+    - `low`, `high`: limits of the plausible values in that unit, far wider than the values of any instrument,
+      leaf or map.
+    - `confused_units`: for each unit that is given by mistake, its size in units of the quantity; the
+      likelier ones come first.
     """
 
     unit: str
@@ -449,46 +428,9 @@ class Magnitude(NamedTuple):
     high: float
     confused_units: dict[str, float]
 
+    def __str__(self) -> str:
+        return self.unit
 
-# The ranges are far wider than those of any instrument, leaf or map.
-MAGNITUDES = {
-    # From the far ultraviolet to a tenth of a millimetre.
-    "wavelength": Magnitude("nm", 100.0, 1e5, {"um": 1e3, "m": 1e9, "pm": 1e-3}),
-    # From a bench to beyond all orbits.
-    "altitude": Magnitude("m", 1.0, 1e8, {"km": 1e3, "mm": 1e-3}),
-    # From less than the diffraction of a telescope of 2 m to the largest that is admissible.
-    "divergence": Magnitude("mrad", 4e-4, 300.0, {"rad": 1e3, "urad": 1e-3}),
-    # From less than a hundredth of any beam to the whole half-space.
-    "field_of_view": Magnitude("mrad", 5e-5, 3.2e3, {"rad": 1e3, "urad": 1e-3}),
-    "aperture": Magnitude("m", 0.0, 100.0, {"mm": 1e-3, "cm": 1e-2}),
-    # From one pulse in two seconds; and from half angles that are narrower than any in use.
-    "pulse_rate": Magnitude("1/s", 0.5, np.inf, {"MHz": 1e6, "kHz": 1e3}),
-    "half_angle": Magnitude("degrees", 0.8, 90.0, {"rad": 180.0 / np.pi}),
-    "energy": Magnitude("J", 0.0, 100.0, {"uJ": 1e-6, "mJ": 1e-3}),
-    # From a femtosecond.
-    "sampling_interval": Magnitude("ns", 1e-6, np.inf, {"s": 1e9}),
-    # To two microseconds: pulses of wind lidars last less than one.
-    "fwhm": Magnitude("ns", 1e-6, 2e3, {"s": 1e9, "ps": 1e-3}),
-    "length": Magnitude("ns", 1e-6, 2e3, {"s": 1e9, "ps": 1e-3}),
-    "decay": Magnitude("ns", 1e-6, 2e3, {"s": 1e9, "ps": 1e-3}),
-    "jitter": Magnitude("ns", 1e-6, 2e3, {"s": 1e9, "ps": 1e-3}),
-    "voxel_size": Magnitude("m", 1e-4, 1e3, {"mm": 1e-3, "cm": 1e-2, "km": 1e3}),
-    # From dense fog; air without any aerosol has some 300 km.
-    "visibility": Magnitude("km", 1e-3, 1e3, {"m": 1e-3}),
-    "rayleigh_scale_height": Magnitude("m", 100.0, 1e5, {"km": 1e3}),
-    "aerosol_scale_height": Magnitude("m", 10.0, 1e5, {"km": 1e3}),
-    # Leaves hold 0 to 150 ug/cm2 of a pigment, 0.001 to 0.1 cm of water, 0.001 to 0.05 g/cm2 of dry matter.
-    "Cab": Magnitude("ug/cm2", 0.0, 300.0, {"mg/m2": 0.1, "ug/m2": 1e-4}),
-    "Car": Magnitude("ug/cm2", 0.0, 300.0, {"mg/m2": 0.1, "ug/m2": 1e-4}),
-    "Cant": Magnitude("ug/cm2", 0.0, 300.0, {"mg/m2": 0.1, "ug/m2": 1e-4}),
-    "Cw": Magnitude("cm", 0.0, 1.0, {"um": 1e-4, "g/m2": 1e-4}),
-    "Cm": Magnitude("g/cm2", 0.0, 1.0, {"g/m2": 1e-4, "ug/cm2": 1e-6}),
-    "Cp": Magnitude("g/cm2", 0.0, 1.0, {"g/m2": 1e-4, "ug/cm2": 1e-6}),
-    "Cc": Magnitude("g/cm2", 0.0, 1.0, {"g/m2": 1e-4, "ug/cm2": 1e-6}),
-    # The tallest tree has 116 m, the thickest 12 m.
-    "height": Magnitude("m", 0.0, 200.0, {"cm": 1e-2, "mm": 1e-3}),
-    "trunk_diameter": Magnitude("m", 0.0, 20.0, {"cm": 1e-2, "mm": 1e-3}),
-}
 
 _PROJECT_PACKAGES = ("jaxlidar", "inversion")
 # Packages whose frames lie between a user's line and a warning of the project.
@@ -499,21 +441,14 @@ _INTERNAL_PACKAGES = (
 )
 
 
-def warn_units(module: object) -> None:
-    """Apply `warn_unit` to every field of a module under construction that `MAGNITUDES` lists."""
-    for field in MAGNITUDES:
-        if hasattr(module, field):
-            warn_unit(field, getattr(module, field))
-
-
-def warn_unit(field: str, x: object) -> None:
+def warn_unit(field: str, x: object, magnitude: Magnitude) -> None:
     """Warn if a value of `x` is so far from the plausible values of its field that another unit is likely.
 
-    Zero, where it is admissible, gives no warning, and tracers pass. `MAGNITUDES` lists the plausible values.
+    Zero, where it is admissible, gives no warning, and tracers pass.
 
     **Warns:** `UnitWarning`, at the user's line that led to this call, with the likely unit.
     """
-    unit, low, high, confused_units = MAGNITUDES[field]
+    unit, low, high, confused_units = magnitude
     values = concrete(x)
     if values is None:
         return

@@ -1,17 +1,17 @@
-"""Admissible ranges, stated once for each class.
+"""Quantities: the unit, the admissible range and the plausible values of a field, stated where it is defined.
 
 Constructors refuse concrete values outside their range; `inadmissible` detects traced ones.
 
-A class states its ranges in the mapping `ranges`, by field. A key may also be a sum of fields, as in
-"reflectance + transmittance", or a product. A field that is None, or a module such as a `Spectrum` in the
-place of numbers, is skipped: a module states its own ranges.
+Besides the fields that `quantity` makes, a class may state ranges in the mapping `ranges`, by field. A key
+may also be a sum of fields, as in "reflectance + transmittance", or a product. A field that is None, or a
+module such as a `Spectrum` in the place of numbers, is skipped: a module states its own ranges.
 """
 
 import dataclasses
 import functools
 import operator
-from collections.abc import Iterator, Mapping
-from typing import Any, NamedTuple
+from collections.abc import Callable, Iterator, Mapping
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool
 
-from jaxlidar._fields.checks import as_array, check_range
+from jaxlidar._fields.checks import Magnitude, as_array, check_range, warn_unit
 
 # Tolerance at a closed limit, in units of the floating-point precision: a value at the limit, such as a sum
 # of reflectance and transmittance that is 1, may exceed it by rounding.
@@ -59,20 +59,77 @@ class Range(NamedTuple):
     increasing: bool = False
 
 
+FINITE, NOT_NEGATIVE, POSITIVE = Range(), Range(0.0), Range(0.0, low_open=True)
 # The range of a reflectance, a transmittance, a probability.
 FRACTION = Range(0.0, 1.0)
 # The range of reflectance + transmittance, which rounding may lift above 1.
 SUM_OF_FRACTIONS = Range(0.0, 1.0 + 1e-6)
+WAVELENGTHS = Range(0.0, low_open=True, increasing=True)
+
+DEGREES = "degrees"
+COMPASS = "degrees clockwise from north"
+# Plausible from the far ultraviolet to a tenth of a millimetre.
+NANOMETRES = Magnitude("nm", 100.0, 1e5, {"um": 1e3, "m": 1e9, "pm": 1e-3})
+# Plausible from a femtosecond to two microseconds: pulses of wind lidars last less than one.
+NANOSECONDS = Magnitude("ns", 1e-6, 2e3, {"s": 1e9, "ps": 1e-3})
+
+if TYPE_CHECKING:
+    # Type checkers know this function: from `converter` and `default` they infer what constructors take.
+    quantity = eqx.field
+else:
+
+    def quantity(
+        *,
+        unit: str | Magnitude = "",
+        range: Range = FINITE,
+        converter: Callable[..., Any] | None = None,
+        **options: Any,
+    ) -> dataclasses.Field:
+        """Define a field that holds numbers: `eqx.field` with their unit and range.
+
+        **Arguments:** all by keyword.
+
+        - `unit`: the unit, or a `Magnitude` with the values beyond which `check_ranges` warns. Default "": a
+          pure number.
+        - `range`: the admissible range. Default: all finite numbers.
+        - `converter`: a function of the value and of the field's name. Default None: the value stays.
+        - `**options`: as those of `eqx.field`, such as `default`.
+        """
+        convert = None
+        if converter is not None:
+
+            @functools.wraps(converter)
+            def convert(x: Any) -> Any:
+                return converter(x, field.name)
+
+        field = eqx.field(converter=convert, metadata={"unit": unit, "range": range}, **options)
+        return field
+
+
+def _ranges(module: Any) -> Mapping[str, Range]:
+    """Return the ranges of a module by field: those of its quantities, and those in `ranges`."""
+    return _stated(module, "range") | getattr(module, "ranges", {})
+
+
+def _stated(module: Any, property: str) -> dict[str, Any]:
+    """Return what `quantity` states for the fields of a module: `property` is "unit" or "range"."""
+    fields = getattr(module, "__dataclass_fields__", {}).values()
+    return {field.name: field.metadata[property] for field in fields if property in field.metadata}
 
 
 def check_ranges(module: Any) -> None:
-    """Refuse a module with a concrete value outside the range that its class states in `ranges`.
+    """Refuse a module with a concrete value outside the range that its class states.
 
     **Raises:** `ValueError` naming the field, the first offending value and the admissible range.
+
+    **Warns:** `UnitWarning` for a field whose `Magnitude` is stated and its value implausible.
     """
-    for name, admissible in module.ranges.items():
+    for name, admissible in _ranges(module).items():
         if (value := _value(module, name)) is not None:
             check_range(name, value, *admissible[:2], **_openness(admissible))
+    for name, unit in _stated(module, "unit").items():
+        if isinstance(unit, Magnitude):
+            warn_unit(name, getattr(module, name), unit)
 
 
 def inadmissible(tree: Any) -> Bool[Array, ""]:
@@ -108,7 +165,7 @@ def reasons(tree: Any) -> dict[str, Bool[Array, ""]]:
     """
     outside = {}
     for path, module in _modules("", tree):
-        for name, admissible in getattr(module, "ranges", {}).items():
+        for name, admissible in _ranges(module).items():
             if (value := _value(module, name)) is not None:
                 outside[f"{path}.{name}" if path else name] = is_outside(value, admissible)
     return outside

@@ -11,7 +11,8 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import numpy as np
 
-from jaxlidar._fields.checks import MAGNITUDES, check_kind, concrete_array
+from jaxlidar._fields.checks import check_kind, concrete_array
+from jaxlidar._fields.ranges import COMPASS, DEGREES
 from jaxlidar._registry import public_objects
 from jaxlidar.io.dem import DemRead, read_dem
 from jaxlidar.io.inventory import read_inventory
@@ -32,7 +33,7 @@ from jaxlidar.plants.point_canopy import PointCanopy, canopy_from_points
 from jaxlidar.plants.point_cloud import PointCloud
 from jaxlidar.plants.stand import Stand
 from jaxlidar.plants.voxelise import voxelise, voxelise_points
-from jaxlidar.scenes.mesh_surface import MeshInstances, MeshSurface
+from jaxlidar.scenes.mesh_surface import MeshSurface
 from jaxlidar.scenes.surfaces import AbstractGround, AbstractSheet, Ground, Plate
 from jaxlidar.scenes.voxels import VoxelMap
 from jaxlidar.sensors.catalogue import instrument
@@ -40,7 +41,6 @@ from jaxlidar.sensors.lidar import Lidar
 from jaxlidar.sensors.pulse import SampledPulse
 from jaxlidar.sensors.receiver import Receiver
 from jaxlidar.sensors.survey import Survey
-from jaxlidar.sensors.trajectory import Trajectory
 
 # Exported classes of these packages are kinds.
 _PACKAGES = ("jaxlidar.optics.", "jaxlidar.sensors.", "jaxlidar.scenes.")
@@ -74,35 +74,29 @@ _FIELD_NAMES = {
 # Another way to give what a further argument holds, which is the one that is written.
 ALTERNATIVE_ARGUMENTS = {(Lidar, "sensor")}
 
-DEGREES = "degrees"
-COMPASS = "degrees clockwise from north"
+# Units of arguments by name. The fields that `quantity` makes state theirs where they are defined.
 UNITS = {
-    **{name: magnitude.unit for name, magnitude in MAGNITUDES.items()},
     "alpha": DEGREES,
+    "altitude": "m",
     "angle": DEGREES,
     "angle_spread": DEGREES,
     "area": "m",
-    "aspect": COMPASS,
     "attitude": DEGREES,
     "azimuth": COMPASS,
-    "background": "J per sample",
-    "background_rate": "1/s",
-    "base_height": "m",
     "beam_spacing": "m",
     "bend": DEGREES,
     "bin_width": "ns",
     "bounds": "m",
     "clump_diameter": "m",
-    "dead_time": "ns",
-    "detection_threshold": "J per sample",
-    "electronic_noise": "J per sample",
+    "divergence": DEGREES,
     "end": "m",
     "frequency": "1/s",
     "gps_time": "s",
+    "half_angle": DEGREES,
+    "height": "m",
     "heights": "m",
     "leaf_area": "m2",
     "leaf_length": "m",
-    "lidar_ratio": "sr",
     "line_rate": "1/s",
     "max_seconds": "s",
     "mean": DEGREES,
@@ -115,40 +109,34 @@ UNITS = {
     "points": "m",
     "position": "m",
     "pitch": DEGREES,
+    "pulse_rate": "1/s",
     "roll": DEGREES,
-    "roughness": "rad",
     "scan_angle": DEGREES,
-    "shift": "m",
-    "saturation": "J per sample",
     "sensor": "m",
     "shoot_angle": DEGREES,
     "shoot_length": "m",
-    "slope": DEGREES,
     "smallest_diameter": "m",
     "spacing": "m",
     "stated": "m and degrees",
     "speed": "m/s",
     "start": "m",
     "stem_angle": DEGREES,
-    "time": "ns",
+    "time": "s",
     "tropism": DEGREES,
+    "trunk_diameter": "m",
+    "voxel_size": "m",
+    "wavelength": "nm",
     "window": "ns",
     "yaw": COMPASS,
     "zenith": DEGREES,
 }
 # Where the same name has a unit in one class alone.
 UNITS_OF = {
-    (Branching, "divergence"): DEGREES,
     (read_dem, "fill"): "m",
     (stand_from_inventory, "area"): "m2",
-    (MeshInstances, "rotation"): DEGREES,
     (Mesh, "vertices"): "m",
     (Survey.grid, "low"): "m",
     (Survey.grid, "high"): "m",
-    (Survey, "time"): "s",
-    (Trajectory, "time"): "s",
-    (VoxelMap, "leaf"): "1/m",
-    (VoxelMap, "bark"): "1/m",
 }
 
 
@@ -195,6 +183,8 @@ def arguments_of(kind: Callable[..., Any]) -> Mapping[str, Argument]:
         field = _FIELD_NAMES.get((kind, name), name)  # pyright: ignore[reportArgumentType, reportCallIssue]
         annotation = fields[field].type if field in fields else annotations.get(name, Any)
         unit = UNITS_OF.get((kind, name), UNITS.get(name, ""))  # pyright: ignore[reportArgumentType, reportCallIssue]
+        if field in fields:
+            unit = str(fields[field].metadata.get("unit") or unit)
         arguments[name] = Argument(annotation, parameter.default is parameter.empty, unit, field)
     return arguments
 

@@ -28,15 +28,15 @@ as `law=`. `examples/minnaert.py` shows Minnaert's law.
 """
 
 import abc
-from typing import ClassVar, final
+from typing import final
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxlidar._fields.checks import scalar
-from jaxlidar._fields.ranges import Range, check_ranges
+from jaxlidar._fields.checks import as_scalar
+from jaxlidar._fields.ranges import Range, check_ranges, quantity
 from jaxlidar._vectors import Scalar, Vec, cosine_direction, cross, dot, from_frame, polar, vec
 
 
@@ -258,9 +258,9 @@ class Specular(AbstractMirror):
     50.0
     """
 
-    roughness: Float[Array, ""] = eqx.field(converter=scalar("roughness"), default=0.0)
-
-    ranges: ClassVar = {"roughness": Range(0.0, 0.5)}
+    roughness: Float[Array, ""] = quantity(
+        unit="rad", range=Range(0.0, 0.5), converter=as_scalar, default=0.0
+    )
 
     def __check_init__(self):
         check_ranges(self)

@@ -8,8 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from jaxlidar._fields.checks import array
-from jaxlidar._fields.ranges import FRACTION, SUM_OF_FRACTIONS, check_ranges
+from jaxlidar._fields.checks import as_array
+from jaxlidar._fields.ranges import FRACTION, SUM_OF_FRACTIONS, check_ranges, quantity
 
 
 @final
@@ -34,14 +34,10 @@ class LeafOptics(eqx.Module):
     ['0.10', '0.45'] ['0.05', '0.40']
     """
 
-    reflectance: Float[Array, "*wavelengths"] = eqx.field(converter=array("reflectance"))
-    transmittance: Float[Array, "*wavelengths"] = eqx.field(converter=array("transmittance"), default=0.0)
+    reflectance: Float[Array, "*wavelengths"] = quantity(range=FRACTION, converter=as_array)
+    transmittance: Float[Array, "*wavelengths"] = quantity(range=FRACTION, converter=as_array, default=0.0)
 
-    ranges: ClassVar = {
-        "reflectance": FRACTION,
-        "transmittance": FRACTION,
-        "reflectance + transmittance": SUM_OF_FRACTIONS,
-    }
+    ranges: ClassVar = {"reflectance + transmittance": SUM_OF_FRACTIONS}
 
     def __check_init__(self):
         for name in ("reflectance", "transmittance"):

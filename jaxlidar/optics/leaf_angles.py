@@ -22,15 +22,15 @@ times the leaf area density; for spherical leaves G is 1/2 in every direction. T
 c^2 + s^2/2 averaged over theta, divided by G is the intensity factor of the leaves' backscatter.
 """
 
-from typing import ClassVar, final
+from typing import final
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxlidar._fields.checks import array, as_scalar, check_choice, check_range, concrete
-from jaxlidar._fields.ranges import Range, check_ranges
+from jaxlidar._fields.checks import as_array, as_scalar, check_choice, check_range, concrete
+from jaxlidar._fields.ranges import NOT_NEGATIVE, check_ranges, quantity
 from jaxlidar._jax.products import matmul
 
 # Cells of inclination, one degree wide; nodes of |cos zenith| of the tables of G.
@@ -63,9 +63,7 @@ class LeafAngles(eqx.Module):
     0.849
     """
 
-    probability: Float[Array, "90"] = eqx.field(converter=array("probability"))
-
-    ranges: ClassVar = {"probability": Range(0.0)}
+    probability: Float[Array, "90"] = quantity(range=NOT_NEGATIVE, converter=as_array)
 
     def __check_init__(self):
         if self.probability.shape != (ANGLE_CELLS,):

@@ -16,15 +16,15 @@ three methods, and pass it as `leaf=` or `bark=` of a `Canopy`.
 """
 
 import abc
-from typing import ClassVar, final
+from typing import final
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxlidar._fields.checks import array, scalar
-from jaxlidar._fields.ranges import FRACTION, Range, check_ranges
+from jaxlidar._fields.checks import as_array, as_scalar
+from jaxlidar._fields.ranges import FRACTION, Range, check_ranges, quantity
 from jaxlidar._vectors import Scalar, Vec, dot, from_frame, polar
 
 # Pi times the density 1/(4 pi) of isotropic scattering.
@@ -129,9 +129,7 @@ class Isotropic(AbstractPhase):
     ['0.1', '0.9']
     """
 
-    albedo: Float[Array, "..."] = eqx.field(converter=array("albedo"))
-
-    ranges: ClassVar = {"albedo": FRACTION}
+    albedo: Float[Array, "..."] = quantity(range=FRACTION, converter=as_array)
 
     def __check_init__(self):
         _check_phase(self)
@@ -173,10 +171,8 @@ class HenyeyGreenstein(AbstractPhase):
     1.500 forward, 0.056 back
     """
 
-    albedo: Float[Array, "..."] = eqx.field(converter=array("albedo"))
-    g: Float[Array, ""] = eqx.field(converter=scalar("g"), default=0.0)
-
-    ranges: ClassVar = {"albedo": FRACTION, "g": Range(-0.95, 0.95)}
+    albedo: Float[Array, "..."] = quantity(range=FRACTION, converter=as_array)
+    g: Float[Array, ""] = quantity(range=Range(-0.95, 0.95), converter=as_scalar, default=0.0)
 
     def __check_init__(self):
         _check_phase(self)

@@ -31,7 +31,7 @@ carbon-based constituents in "PRO". Numerical limits: see `jaxlidar.plate_model`
 
 import functools
 from collections.abc import Sequence
-from typing import Any, ClassVar, final
+from typing import Any, final
 
 import equinox as eqx
 import jax
@@ -41,6 +41,7 @@ from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Float
 
 from jaxlidar._fields.checks import (
+    Magnitude,
     as_numpy,
     as_scalar,
     check_choice,
@@ -50,9 +51,8 @@ from jaxlidar._fields.checks import (
     check_numbers,
     check_range,
     concrete,
-    warn_units,
 )
-from jaxlidar._fields.ranges import Range, check_ranges
+from jaxlidar._fields.ranges import NOT_NEGATIVE, Range, check_ranges, quantity
 from jaxlidar._jax.one_function import barrier
 from jaxlidar._jax.products import tensordot
 from jaxlidar.optics.coefficients import TRAITS, Coefficients, shipped
@@ -60,6 +60,10 @@ from jaxlidar.optics.leaf_surface import LeafSurface, leaf_surface
 from jaxlidar.optics.plate_model import plate_model, plate_model_slopes
 from jaxlidar.optics.spectra import interpolate
 
+# Leaves hold 0 to 150 ug/cm2 of a pigment, 0.001 to 0.1 cm of water, 0.001 to 0.05 g/cm2 of dry matter.
+_PIGMENT = Magnitude("ug/cm2", 0.0, 300.0, {"mg/m2": 0.1, "ug/m2": 1e-4})
+_WATER = Magnitude("cm", 0.0, 1.0, {"um": 1e-4, "g/m2": 1e-4})
+_DRY_MATTER = Magnitude("g/cm2", 0.0, 1.0, {"g/m2": 1e-4, "ug/cm2": 1e-6})
 _DEFAULTS = {
     "Cab": 40.0,
     "Car": 8.0,
@@ -121,20 +125,18 @@ class Prospect(eqx.Module):
     ['0.16', '0.44'] ['0.16', '0.48']
     """
 
-    N: Float[Array, ""]
-    Cab: Float[Array, ""]
-    Car: Float[Array, ""]
-    Cant: Float[Array, ""]
-    Cbrown: Float[Array, ""]
-    Cw: Float[Array, ""]
-    Cm: Float[Array, ""]
-    Cp: Float[Array, ""]
-    Cc: Float[Array, ""]
+    N: Float[Array, ""] = quantity(range=Range(1.0))
+    Cab: Float[Array, ""] = quantity(unit=_PIGMENT, range=NOT_NEGATIVE)
+    Car: Float[Array, ""] = quantity(unit=_PIGMENT, range=NOT_NEGATIVE)
+    Cant: Float[Array, ""] = quantity(unit=_PIGMENT, range=NOT_NEGATIVE)
+    Cbrown: Float[Array, ""] = quantity(range=NOT_NEGATIVE)
+    Cw: Float[Array, ""] = quantity(unit=_WATER, range=NOT_NEGATIVE)
+    Cm: Float[Array, ""] = quantity(unit=_DRY_MATTER, range=NOT_NEGATIVE)
+    Cp: Float[Array, ""] = quantity(unit=_DRY_MATTER, range=NOT_NEGATIVE)
+    Cc: Float[Array, ""] = quantity(unit=_DRY_MATTER, range=NOT_NEGATIVE)
     version: str = eqx.field(static=True)
     alpha: float = eqx.field(static=True)
     coefficients: Coefficients | None = eqx.field(static=True)
-
-    ranges: ClassVar = {"N": Range(1.0)} | dict.fromkeys(_DEFAULTS, Range(0.0))
 
     def __init__(
         self,
@@ -176,7 +178,6 @@ class Prospect(eqx.Module):
             setattr(self, name, _trait(name, value))
         self.version, self.alpha, self.coefficients = version, float(alpha), coefficients
         check_ranges(self)
-        warn_units(self)
 
     @classmethod
     def paper(cls) -> "Prospect":

@@ -30,16 +30,22 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from jaxlidar._fields.checks import (
-    array,
     as_array,
+    as_scalar,
     check_choice,
     check_kind,
     check_range,
     concrete,
-    scalar,
-    warn_units,
 )
-from jaxlidar._fields.ranges import FRACTION, SUM_OF_FRACTIONS, Range, check_ranges
+from jaxlidar._fields.ranges import (
+    FRACTION,
+    NANOMETRES,
+    NOT_NEGATIVE,
+    SUM_OF_FRACTIONS,
+    WAVELENGTHS,
+    check_ranges,
+    quantity,
+)
 
 # The largest wavelength, nm, that is finite in single precision.
 _LARGEST_SINGLE = float(np.finfo(np.float32).max)
@@ -71,17 +77,12 @@ class Spectrum(eqx.Module):
     0.305
     """
 
-    wavelength: Float[Array, " samples"] = eqx.field(converter=array("wavelength"))
-    reflectance: Float[Array, " samples"] = eqx.field(converter=array("reflectance"))
+    wavelength: Float[Array, " samples"] = quantity(unit=NANOMETRES, range=WAVELENGTHS, converter=as_array)
+    reflectance: Float[Array, " samples"] = quantity(range=FRACTION, converter=as_array)
     name: str = eqx.field(static=True, default="")
-    scale: Float[Array, ""] = eqx.field(converter=scalar("scale"), default=1.0)
+    scale: Float[Array, ""] = quantity(range=NOT_NEGATIVE, converter=as_scalar, default=1.0)
 
-    ranges: ClassVar = {
-        "wavelength": Range(0.0, low_open=True, increasing=True),
-        "reflectance": FRACTION,
-        "scale": Range(0.0),
-        "scale * reflectance": SUM_OF_FRACTIONS,
-    }
+    ranges: ClassVar = {"scale * reflectance": SUM_OF_FRACTIONS}
 
     def __check_init__(self):
         if self.wavelength.shape != self.reflectance.shape or self.wavelength.ndim != 1:
@@ -99,7 +100,6 @@ class Spectrum(eqx.Module):
                 f"wavelength = {wavelength[i]:g} is followed by {wavelength[i + 1]:g}; the admissible ones "
                 "increase strictly"
             )
-        warn_units(self)
 
     def __call__(self, wavelength: ArrayLike) -> Float[Array, "..."]:
         """Interpolate the reflectance at wavelengths.

@@ -26,12 +26,13 @@ from typing import Any, final
 import numpy as np
 
 from jaxlidar._fields.checks import (
+    Magnitude,
     check_integer,
     check_kind,
     check_number,
     check_seed,
     check_shape,
-    warn_units,
+    warn_unit,
 )
 from jaxlidar.plants.lsystem import Item, LSystem, Rule, Word
 from jaxlidar.plants.tree import Tree
@@ -43,6 +44,9 @@ GOLDEN_ANGLE = 137.50776405
 DIVERGENCE_SPREAD = 15.0
 SHOOT_SPREAD = 28.0
 # Fields of a tree that have an element per bud.
+# The tallest tree has 116 m, the thickest 12 m.
+_HEIGHT = Magnitude("m", 0.0, 200.0, {"cm": 1e-2, "mm": 1e-3})
+_DIAMETER = Magnitude("m", 0.0, 20.0, {"cm": 1e-2, "mm": 1e-3})
 BUDS = ("bud_position", "bud_direction", "bud_radius")
 
 
@@ -171,7 +175,8 @@ class Habit:
             object.__setattr__(self, name, check_integer(name, getattr(self, name), low))
         check_kind("trunk", self.trunk, Branching, "a Branching")
         check_kind("branches", self.branches, Branching, "a Branching")
-        warn_units(self)
+        warn_unit("height", self.height, _HEIGHT)
+        warn_unit("trunk_diameter", self.trunk_diameter, _DIAMETER)
 
     def wood(self) -> LSystem:
         """The L-system that grows the wood.

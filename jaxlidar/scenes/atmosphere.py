@@ -33,7 +33,7 @@ bands of water vapour (0.94, 1.13, 1.38, 1.87 micrometres) and oxygen (0.76).
 """
 
 import math
-from typing import ClassVar, final
+from typing import final
 
 import equinox as eqx
 import jax
@@ -41,16 +41,15 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
 from jaxlidar._fields.checks import (
+    Magnitude,
     as_array,
+    as_optional_scalar,
     as_scalar,
     check_choice,
     check_flag,
     check_range,
-    optional_scalar,
-    scalar,
-    warn_units,
 )
-from jaxlidar._fields.ranges import Range, check_ranges
+from jaxlidar._fields.ranges import POSITIVE, Range, check_ranges, quantity
 from jaxlidar._text import object_text
 
 # Admissible wavelengths, nm. Peck and Reeder's formula is fitted to 230..1690 nm and smooth far beyond; the
@@ -201,25 +200,27 @@ class Atmosphere(eqx.Module):
     0.788
     """
 
-    visibility: Float[Array, ""] | None = eqx.field(converter=optional_scalar("visibility"), default=23.0)
+    # Plausible from dense fog; air without any aerosol has some 300 km.
+    visibility: Float[Array, ""] | None = quantity(
+        unit=Magnitude("km", 1e-3, 1e3, {"m": 1e-3}),
+        range=POSITIVE,
+        converter=as_optional_scalar,
+        default=23.0,
+    )
     rayleigh: bool = eqx.field(static=True, default=True)
     aerosol_model: str = eqx.field(static=True, default="kim")
-    rayleigh_scale_height: Float[Array, ""] = eqx.field(
-        converter=scalar("rayleigh_scale_height"), default=8450.0
+    rayleigh_scale_height: Float[Array, ""] = quantity(
+        unit=Magnitude("m", 100.0, 1e5, {"km": 1e3}), range=POSITIVE, converter=as_scalar, default=8450.0
     )
-    aerosol_scale_height: Float[Array, ""] = eqx.field(
-        converter=scalar("aerosol_scale_height"), default=1400.0
+    aerosol_scale_height: Float[Array, ""] = quantity(
+        unit=Magnitude("m", 10.0, 1e5, {"km": 1e3}), range=POSITIVE, converter=as_scalar, default=1400.0
     )
-    lidar_ratio: Float[Array, ""] | None = eqx.field(converter=optional_scalar("lidar_ratio"), default=None)
-    base_height: Float[Array, ""] = eqx.field(converter=scalar("base_height"), default=0.0)
-
-    ranges: ClassVar = {
-        "visibility": Range(0.0, low_open=True),
-        "rayleigh_scale_height": Range(0.0, low_open=True),
-        "aerosol_scale_height": Range(0.0, low_open=True),
-        "lidar_ratio": Range(0.0, low_open=True),
-        "base_height": Range(-500.0, 9000.0),
-    }
+    lidar_ratio: Float[Array, ""] | None = quantity(
+        unit="sr", range=POSITIVE, converter=as_optional_scalar, default=None
+    )
+    base_height: Float[Array, ""] = quantity(
+        unit="m", range=Range(-500.0, 9000.0), converter=as_scalar, default=0.0
+    )
 
     def __str__(self) -> str:
         return object_text(self)
@@ -228,7 +229,6 @@ class Atmosphere(eqx.Module):
         check_flag("rayleigh", self.rayleigh)
         check_choice("aerosol_model", self.aerosol_model, ("kim", "kruse"))
         check_ranges(self)
-        warn_units(self)
 
     def _layers(self, wavelength: ArrayLike) -> list[tuple[Array, Array, Array | float]]:
         """List extinction at z = 0 (1/m), scale height (m) and lidar ratio (sr) of molecules and aerosol."""

@@ -7,7 +7,7 @@ T).
 """
 
 from collections.abc import Callable
-from typing import Any, ClassVar, final
+from typing import Any, final
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -23,16 +23,16 @@ from jaxlidar._fields.checks import (
     concrete,
     kind_of,
 )
-from jaxlidar._fields.ranges import FRACTION
+from jaxlidar._fields.ranges import FRACTION, quantity
 from jaxlidar._text import object_text
 from jaxlidar.optics.phase import AbstractPhase
 from jaxlidar.optics.spectra import Spectrum, reflectance_at
-from jaxlidar.scenes.surfaces import Reflectance, check_reflectance, reflectance_field
+from jaxlidar.scenes.surfaces import Reflectance, as_reflectance, check_reflectance
 from jaxlidar.scenes.voxels import VoxelMap
 
 
-def _as_bark(x: Any) -> Any:
-    return x if isinstance(x, AbstractPhase | None) else reflectance_field("bark")(x)
+def _as_bark(x: Any, field: str = "bark") -> Any:
+    return x if isinstance(x, AbstractPhase | None) else as_reflectance(x, field)
 
 
 @final
@@ -73,12 +73,10 @@ class Canopy(eqx.Module):
 
     voxels: VoxelMap
     leaf: Callable | AbstractPhase | None = None
-    bark: Reflectance | AbstractPhase | None = eqx.field(converter=_as_bark, default=None)
+    bark: Reflectance | AbstractPhase | None = quantity(range=FRACTION, converter=_as_bark, default=None)
     transmission: str = eqx.field(static=True, default="diffuse")
     hotspot: bool = eqx.field(static=True, default=True)
     sides: str = eqx.field(static=True, default="open")
-
-    ranges: ClassVar = {"bark": FRACTION}
 
     def __str__(self) -> str:
         return object_text(self)

@@ -33,7 +33,7 @@ from jaxlidar._fields.checks import (
     has_tracers,
     kind_of,
 )
-from jaxlidar._fields.ranges import SUM_OF_FRACTIONS, Range, check_ranges
+from jaxlidar._fields.ranges import DEGREES, FINITE, POSITIVE, SUM_OF_FRACTIONS, check_ranges, quantity
 from jaxlidar._jax.products import einsum, matmul
 from jaxlidar._vectors import FAR, Scalar, Vec, along, dot, vec
 from jaxlidar.optics.laws import AbstractLaw, AbstractMirror, Lambertian
@@ -42,9 +42,9 @@ from jaxlidar.scenes.shapes import AbstractShape
 from jaxlidar.scenes.surfaces import (
     AbstractSheet,
     Reflectance,
+    as_reflectance,
     check_reflectance,
     check_sum,
-    reflectance_field,
 )
 from jaxlidar.scenes.triangle_tree import (
     ROW,
@@ -110,11 +110,9 @@ class MeshInstances(eqx.Module):
     [[0.0, 2.0, 0.0], [-2.0, 0.0, 0.0], [0.0, 0.0, 2.0]]
     """
 
-    shift: Float[Array | np.ndarray, "n 3"]
-    rotation: Float[Array, "n 3"]
-    scale: Float[Array, " n"]
-
-    ranges: ClassVar = {"shift": Range(), "rotation": Range(), "scale": Range(0.0, low_open=True)}
+    shift: Float[Array | np.ndarray, "n 3"] = quantity(unit="m")
+    rotation: Float[Array, "n 3"] = quantity(unit=DEGREES)
+    scale: Float[Array, " n"] = quantity(range=POSITIVE)
 
     def __init__(
         self, shift: ArrayLike | Sequence, rotation: ArrayLike | Sequence | None = None, scale: Any = None
@@ -224,7 +222,7 @@ class MeshSurface(eqx.Module):
     # That of a scene with periodic sides, where what repeats is left out of a simulation; else None.
     period: Float[Array, "2"] | None
 
-    ranges: ClassVar = {"vertices": Range(), "optics": SUM_OF_FRACTIONS}
+    ranges: ClassVar = {"vertices": FINITE, "optics": SUM_OF_FRACTIONS}
 
     def __init__(
         self,
@@ -469,7 +467,7 @@ def _check_rounding(
 def _optics_by_material(field: str, value: Any, materials: tuple[str, ...], missing: Any = None) -> Any:
     """Convert a reflectance or transmittance, or a dict of such by name of material."""
     if not isinstance(value, Mapping):
-        converted = reflectance_field(field)(value)
+        converted = as_reflectance(value, field)
         return dict.fromkeys(materials, converted) if materials else converted
     for name in value:
         if name not in materials:
@@ -477,7 +475,7 @@ def _optics_by_material(field: str, value: Any, materials: tuple[str, ...], miss
     for name in materials:
         if name not in value and missing is None:
             raise ValueError(f"{field} has no {name!r}; admissible is a value for each material of the mesh")
-    return {name: reflectance_field(f"{field}[{name!r}]")(value.get(name, missing)) for name in materials}
+    return {name: as_reflectance(value.get(name, missing), f"{field}[{name!r}]") for name in materials}
 
 
 @final

@@ -11,7 +11,6 @@ h at the position (x0, y0):
 """
 
 import abc
-from collections.abc import Callable
 from typing import Any, ClassVar, TypeVar, final
 
 import equinox as eqx
@@ -22,15 +21,23 @@ from jaxtyping import Array, Float
 from jaxlidar._fields.checks import (
     as_array,
     as_numpy,
+    as_scalar,
     check_choice,
     check_kind,
     check_numbers,
     check_range,
     concrete,
     coordinates,
-    scalar,
 )
-from jaxlidar._fields.ranges import FRACTION, SUM_OF_FRACTIONS, Range, check_ranges
+from jaxlidar._fields.ranges import (
+    COMPASS,
+    DEGREES,
+    FRACTION,
+    SUM_OF_FRACTIONS,
+    Range,
+    check_ranges,
+    quantity,
+)
 from jaxlidar._text import object_text
 from jaxlidar.optics.laws import AbstractLaw, Lambertian
 from jaxlidar.optics.spectra import Spectrum
@@ -40,25 +47,15 @@ from jaxlidar.scenes.shapes import AbstractShape, Plane
 # A reflectance is one number, one number per wavelength, or a spectrum.
 Reflectance = Float[Array, ""] | Float[Array, "wavelengths"] | Spectrum
 
-# Ranges of the fields that place a plane.
-_PLANE_RANGES = {
-    "height": Range(),
-    "slope": Range(0.0, 90.0, high_open=True, mirrored=True),
-    "aspect": Range(),
-    "position": Range(),
-}
+_SLOPES = Range(0.0, 90.0, high_open=True, mirrored=True)
 
 
-def reflectance_field(field: str) -> Callable[[Any], Any]:
-    """Make the converter of a field that is a reflectance: a `Spectrum` stays, numbers become an array."""
-
-    def convert(x: Any) -> Any:
-        if isinstance(x, Spectrum):
-            return x
-        check_numbers(field, x, "real numbers or a Spectrum")
-        return as_array(x, field)
-
-    return convert
+def as_reflectance(x: Any, field: str = "reflectance") -> Any:
+    """Convert a field that is a reflectance: a `Spectrum` stays, numbers become an array."""
+    if isinstance(x, Spectrum):
+        return x
+    check_numbers(field, x, "real numbers or a Spectrum")
+    return as_array(x, field)
 
 
 def check_reflectance(field: str, x: Any) -> None:
@@ -248,16 +245,14 @@ class Ground(AbstractGround):
     normal: -0.342 north, 0.940 up
     """
 
-    height: Float[Array, ""] = eqx.field(converter=scalar("height"), default=0.0)
-    reflectance: Reflectance = eqx.field(converter=reflectance_field("reflectance"), default=0.3)
-    slope: Float[Array, ""] = eqx.field(converter=scalar("slope"), default=0.0)
-    aspect: Float[Array, ""] = eqx.field(converter=scalar("aspect"), default=0.0)
+    height: Float[Array, ""] = quantity(unit="m", converter=as_scalar, default=0.0)
+    reflectance: Reflectance = quantity(range=FRACTION, converter=as_reflectance, default=0.3)
+    slope: Float[Array, ""] = quantity(unit=DEGREES, range=_SLOPES, converter=as_scalar, default=0.0)
+    aspect: Float[Array, ""] = quantity(unit=COMPASS, converter=as_scalar, default=0.0)
     law: AbstractLaw = Lambertian()
-    position: Float[Array | np.ndarray, " 2"] = eqx.field(
-        converter=coordinates("position", 2), default=(0.0, 0.0)
+    position: Float[Array | np.ndarray, " 2"] = quantity(
+        unit="m", converter=coordinates(2), default=(0.0, 0.0)
     )
-
-    ranges: ClassVar = _PLANE_RANGES | {"reflectance": FRACTION}
 
     def __check_init__(self):
         check_kind("law", self.law, AbstractLaw, "a law of reflection, such as Lambertian()")
@@ -310,24 +305,19 @@ class Plate(AbstractSheet):
     0.15 of the light is absorbed
     """
 
-    height: Float[Array, ""] = eqx.field(converter=scalar("height"))
-    reflectance: Reflectance = eqx.field(converter=reflectance_field("reflectance"))
-    transmittance: Reflectance = eqx.field(converter=reflectance_field("transmittance"), default=0.0)
-    coverage: Float[Array, ""] = eqx.field(converter=scalar("coverage"), default=1.0)
-    slope: Float[Array, ""] = eqx.field(converter=scalar("slope"), default=0.0)
-    aspect: Float[Array, ""] = eqx.field(converter=scalar("aspect"), default=0.0)
+    height: Float[Array, ""] = quantity(unit="m", converter=as_scalar)
+    reflectance: Reflectance = quantity(range=FRACTION, converter=as_reflectance)
+    transmittance: Reflectance = quantity(range=FRACTION, converter=as_reflectance, default=0.0)
+    coverage: Float[Array, ""] = quantity(range=FRACTION, converter=as_scalar, default=1.0)
+    slope: Float[Array, ""] = quantity(unit=DEGREES, range=_SLOPES, converter=as_scalar, default=0.0)
+    aspect: Float[Array, ""] = quantity(unit=COMPASS, converter=as_scalar, default=0.0)
     transmission: str = eqx.field(static=True, default="straight")
     law: AbstractLaw = Lambertian()
-    position: Float[Array | np.ndarray, " 2"] = eqx.field(
-        converter=coordinates("position", 2), default=(0.0, 0.0)
+    position: Float[Array | np.ndarray, " 2"] = quantity(
+        unit="m", converter=coordinates(2), default=(0.0, 0.0)
     )
 
-    ranges: ClassVar = _PLANE_RANGES | {
-        "reflectance": FRACTION,
-        "transmittance": FRACTION,
-        "reflectance + transmittance": SUM_OF_FRACTIONS,
-        "coverage": FRACTION,
-    }
+    ranges: ClassVar = {"reflectance + transmittance": SUM_OF_FRACTIONS}
 
     def __check_init__(self):
         check_kind("law", self.law, AbstractLaw, "a law of reflection, such as Lambertian()")

@@ -11,8 +11,7 @@ A periodic terrain has e = n = 0.
 """
 
 import dataclasses
-from collections.abc import Callable
-from typing import Any, ClassVar, final
+from typing import Any, final
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -20,7 +19,6 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from jaxlidar._fields.checks import (
-    array,
     as_array,
     as_numpy,
     check_choice,
@@ -34,7 +32,7 @@ from jaxlidar._fields.checks import (
     coordinates,
     crs_name,
 )
-from jaxlidar._fields.ranges import FRACTION, Range, check_ranges
+from jaxlidar._fields.ranges import FRACTION, POSITIVE, check_ranges, quantity
 from jaxlidar._vectors import normalise
 from jaxlidar.optics.laws import AbstractLaw, AbstractMirror, Lambertian
 from jaxlidar.optics.spectra import Spectrum
@@ -45,8 +43,8 @@ from jaxlidar.scenes.surfaces import (
     AbstractGround,
     Ground,
     Reflectance,
+    as_reflectance,
     check_reflectance,
-    reflectance_field,
 )
 
 # Heights are taken as a plane if they deviate from it by less than this fraction of the spacing, plus this
@@ -55,15 +53,11 @@ _PLANE_TOLERANCE = 1e-5
 _ROUNDING = 4 * float(np.finfo(np.float32).eps)
 
 
-def _pair(field: str) -> Callable[[Any], Float[Array, "2"]]:
-    """Make the converter of a field that is two numbers, or one number for both."""
-
-    def convert(x: Any) -> Float[Array, "2"]:
-        a = as_array(x, field)
-        check_shape(field, a, (), (2,))
-        return jnp.broadcast_to(a, (2,))
-
-    return convert
+def _as_pair(x: Any, field: str = "spacing") -> Float[Array, "2"]:
+    """Convert a field that is two numbers, or one number for both."""
+    a = as_array(x, field)
+    check_shape(field, a, (), (2,))
+    return jnp.broadcast_to(a, (2,))
 
 
 @final
@@ -109,23 +103,16 @@ class Terrain(AbstractGround):
     0.268, of 0.268
     """
 
-    heights: Float[Array, "..."] = eqx.field(converter=array("heights"))
-    spacing: Float[Array, "2"] = eqx.field(converter=_pair("spacing"))
-    origin: Float[Array | np.ndarray, "2"] = eqx.field(converter=coordinates("origin", 2), default=(0.0, 0.0))
-    reflectance: Reflectance | Float[Array, "nx ny"] = eqx.field(
-        converter=reflectance_field("reflectance"), default=0.3
+    heights: Float[Array, "..."] = quantity(unit="m", converter=as_array)
+    spacing: Float[Array, "2"] = quantity(unit="m", range=POSITIVE, converter=_as_pair)
+    origin: Float[Array | np.ndarray, "2"] = quantity(unit="m", converter=coordinates(2), default=(0.0, 0.0))
+    reflectance: Reflectance | Float[Array, "nx ny"] = quantity(
+        range=FRACTION, converter=as_reflectance, default=0.3
     )
     law: AbstractLaw = Lambertian()
     sides: str = eqx.field(static=True, default="open")
     relief: bool = eqx.field(static=True, default=True)
     crs: str | None = eqx.field(static=True, converter=crs_name, default=None)
-
-    ranges: ClassVar = {
-        "heights": Range(),
-        "spacing": Range(0.0, low_open=True),
-        "origin": Range(),
-        "reflectance": FRACTION,
-    }
 
     def __check_init__(self):
         check_choice("sides", self.sides, ("open", "periodic"))

@@ -8,8 +8,8 @@ The extinction coefficient sigma (1/m) follows from
 - the probability p that a ray which crosses one voxel edge d meets material: sigma = -ln(1 - p) / d.
 """
 
-from collections.abc import Callable, Sequence
-from typing import ClassVar, NamedTuple, final
+from collections.abc import Sequence
+from typing import NamedTuple, final
 
 import equinox as eqx
 import jax
@@ -20,8 +20,10 @@ import scipy.sparse
 from jaxtyping import Array, ArrayLike, Float
 
 from jaxlidar._fields.checks import (
+    Magnitude,
     as_array,
     as_numpy,
+    as_optional_array,
     check_kind,
     check_range,
     check_shape,
@@ -30,9 +32,8 @@ from jaxlidar._fields.checks import (
     coordinates,
     crs_name,
     has_tracers,
-    warn_units,
 )
-from jaxlidar._fields.ranges import Range, check_ranges
+from jaxlidar._fields.ranges import NOT_NEGATIVE, POSITIVE, check_ranges, quantity
 from jaxlidar._jax.memory import machine_memory
 from jaxlidar._registry import common_crs
 from jaxlidar._text import object_text
@@ -53,25 +54,12 @@ _BYTES_PER_VOXEL = 40.0
 Numbers = ArrayLike | Sequence
 
 
-def _triple(field: str) -> Callable[[Numbers], Float[Array, "3"]]:
-    """Make the converter of a field that is three numbers, or one number for all three."""
-
-    def convert(x: Numbers) -> Float[Array, "3"]:
-        a = as_array(x, field)
-        check_shape(field, a, (), (3,))
-        value = concrete(a)
-        return jnp.broadcast_to(a, (3,)) if value is None else as_array(np.broadcast_to(value, (3,)))
-
-    return convert
-
-
-def _volume(field: str) -> Callable[[Numbers | None], Float[Array, "..."] | None]:
-    """Make the converter of a field that is an array of numbers or None."""
-
-    def convert(x: Numbers | None) -> Float[Array, "..."] | None:
-        return None if x is None else as_array(x, field)
-
-    return convert
+def _as_triple(x: Numbers, field: str = "voxel_size") -> Float[Array, "3"]:
+    """Convert a field that is three numbers, or one number for all three."""
+    a = as_array(x, field)
+    check_shape(field, a, (), (3,))
+    value = concrete(a)
+    return jnp.broadcast_to(a, (3,)) if value is None else as_array(np.broadcast_to(value, (3,)))
 
 
 @final
@@ -107,19 +95,16 @@ class VoxelMap(eqx.Module):
     """
 
     # The shapes are not part of the types: the constructor compares them, and its error names both.
-    leaf: Float[Array, "..."] | None = eqx.field(converter=_volume("leaf"))
-    bark: Float[Array, "..."] | None = eqx.field(converter=_volume("bark"))
-    voxel_size: Float[Array, "3"] = eqx.field(converter=_triple("voxel_size"))
-    origin: Float[Array | np.ndarray, "3"] = eqx.field(converter=coordinates("origin", 3))
+    leaf: Float[Array, "..."] | None = quantity(unit="1/m", range=NOT_NEGATIVE, converter=as_optional_array)
+    bark: Float[Array, "..."] | None = quantity(unit="1/m", range=NOT_NEGATIVE, converter=as_optional_array)
+    voxel_size: Float[Array, "3"] = quantity(
+        unit=Magnitude("m", 1e-4, 1e3, {"mm": 1e-3, "cm": 1e-2, "km": 1e3}),
+        range=POSITIVE,
+        converter=_as_triple,
+    )
+    origin: Float[Array | np.ndarray, "3"] = quantity(unit="m", converter=coordinates(3))
     leaf_angles: LeafAngles | None = None
     crs: str | None = eqx.field(static=True, converter=crs_name, default=None)
-
-    ranges: ClassVar = {
-        "leaf": Range(0.0),
-        "bark": Range(0.0),
-        "voxel_size": Range(0.0, low_open=True),
-        "origin": Range(),
-    }
 
     def __str__(self) -> str:
         return object_text(self)
@@ -137,7 +122,6 @@ class VoxelMap(eqx.Module):
                 f"leaf or bark has the shape {shape}; admissible is (nx, ny, nz), each at least 1"
             )
         check_ranges(self)
-        warn_units(self)
 
     @property
     def shape(self) -> tuple[int, int, int]:
@@ -199,7 +183,7 @@ class VoxelMap(eqx.Module):
         **Raises:** ValueError for a probability outside [0, 1], and for arguments that `VoxelMap` does not
         admit.
         """
-        size = _triple("voxel_size")(voxel_size)
+        size = _as_triple(voxel_size)
         check_range("voxel_size", size, 0.0, low_open=True)
 
         def extinction(name: str, p: Numbers | None) -> Array | None:
@@ -381,7 +365,7 @@ class VoxelMap(eqx.Module):
         sizes = np.array([concrete_array(voxels.voxel_size) for voxels in maps], float)
         size = sizes.min(axis=0)
         if voxel_size is not None:
-            size = np.asarray(_triple("voxel_size")(voxel_size), float)
+            size = np.asarray(_as_triple(voxel_size), float)
             check_range("voxel_size", size, 0.0, low_open=True)
         places = [_Place.of(voxels, float(turn)) for voxels, turn in zip(maps, turns)]
         # Faces lie at multiples of the edges from the corner of the first map.

@@ -22,7 +22,7 @@ is then the point s + w, 1 m ahead of the sensor: widths of the beam are stated 
 import dataclasses
 import math
 from collections.abc import Sequence
-from typing import Any, ClassVar, final
+from typing import Any, final
 
 import equinox as eqx
 import jax
@@ -31,17 +31,27 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from jaxlidar._fields.checks import (
-    array,
+    Magnitude,
     as_array,
+    as_optional_scalar,
+    as_scalar,
     check_choice,
     check_kind,
     concrete,
     coordinates,
-    optional_scalar,
-    scalar,
-    warn_units,
 )
-from jaxlidar._fields.ranges import Range, check_ranges
+from jaxlidar._fields.ranges import (
+    COMPASS,
+    DEGREES,
+    NANOMETRES,
+    NANOSECONDS,
+    NOT_NEGATIVE,
+    POSITIVE,
+    WAVELENGTHS,
+    Range,
+    check_ranges,
+    quantity,
+)
 from jaxlidar._text import object_text
 from jaxlidar.sensors.photon_counter import PhotonCounter
 from jaxlidar.sensors.pulse import AbstractPulse, GaussianPulse
@@ -70,8 +80,8 @@ _ALTITUDE, _AIM_POINT = _Default("1000.0"), _Default("(0.0, 0.0)")
 _PULSE, _RECEIVER = _Default("GaussianPulse(fwhm=6.0)"), _Default("Receiver()")
 
 
-def _wavelengths(x: ArrayLike | Sequence[ArrayLike]) -> Float[Array, "..."]:
-    return jnp.atleast_1d(as_array(x, "wavelength"))
+def _wavelengths(x: ArrayLike | Sequence[ArrayLike], field: str = "wavelength") -> Float[Array, "..."]:
+    return jnp.atleast_1d(as_array(x, field))
 
 
 def _is_sensor(position: Any) -> bool:
@@ -82,9 +92,9 @@ def _is_sensor(position: Any) -> bool:
     return getattr(position, "shape", ()) == (3,)
 
 
-def _position(x: Any) -> Array | np.ndarray:
+def _position(x: Any, field: str = "position") -> Array | np.ndarray:
     """Convert (x, y) of the aim point, or (x, y, z) of the sensor."""
-    return coordinates("position", 3 if _is_sensor(x) else 2)(x)
+    return coordinates(3 if _is_sensor(x) else 2)(x, field)
 
 
 def tan_half(angle: ArrayLike, xp: Any = jnp) -> Any:
@@ -174,39 +184,46 @@ class Lidar(eqx.Module):
     ['0.250', '0.433', '0.866']
     """
 
-    wavelength: Float[Array, " wavelengths"] = eqx.field(converter=_wavelengths)
-    # None where the sensor is given by its position.
-    altitude: Float[Array, ""] | None = eqx.field(converter=optional_scalar("altitude"))
+    wavelength: Float[Array, " wavelengths"] = quantity(
+        unit=NANOMETRES, range=WAVELENGTHS, converter=_wavelengths
+    )
+    # None where the sensor is given by its position. Plausible from a bench to beyond all orbits.
+    altitude: Float[Array, ""] | None = quantity(
+        unit=Magnitude("m", 1.0, 1e8, {"km": 1e3, "mm": 1e-3}), range=POSITIVE, converter=as_optional_scalar
+    )
     pulse: AbstractPulse
-    divergence: Float[Array, ""] = eqx.field(converter=scalar("divergence"))
-    aperture: Float[Array, ""] = eqx.field(converter=scalar("aperture"))
-    zenith: Float[Array, ""] = eqx.field(converter=scalar("zenith"))
-    azimuth: Float[Array, ""] = eqx.field(converter=scalar("azimuth"))
-    energy: Float[Array, "..."] = eqx.field(converter=array("energy"))
-    sampling_interval: Float[Array, ""] = eqx.field(converter=scalar("sampling_interval"))
+    # Plausible from less than the diffraction of a telescope of 2 m to the largest that is admissible.
+    divergence: Float[Array, ""] = quantity(
+        unit=Magnitude("mrad", 4e-4, _MAX_DIVERGENCE, {"rad": 1e3, "urad": 1e-3}),
+        range=Range(0.0, _MAX_DIVERGENCE),
+        converter=as_scalar,
+    )
+    aperture: Float[Array, ""] = quantity(
+        unit=Magnitude("m", 0.0, 100.0, {"mm": 1e-3, "cm": 1e-2}), range=POSITIVE, converter=as_scalar
+    )
+    zenith: Float[Array, ""] = quantity(
+        unit=DEGREES, range=Range(0.0, STRAIGHT_UP, mirrored=True), converter=as_scalar
+    )
+    azimuth: Float[Array, ""] = quantity(unit=COMPASS, converter=as_scalar)
+    energy: Float[Array, "..."] = quantity(
+        unit=Magnitude("J", 0.0, 100.0, {"uJ": 1e-6, "mJ": 1e-3}), range=POSITIVE, converter=as_array
+    )
+    sampling_interval: Float[Array, ""] = quantity(
+        unit=Magnitude("ns", 1e-6, np.inf, {"s": 1e9}), range=POSITIVE, converter=as_scalar
+    )
     profile: str = eqx.field(static=True)
     # (x, y) of the aim point, or (x, y, z) of the sensor.
-    position: Float[Array | np.ndarray, " axes"] = eqx.field(converter=_position)
-    field_of_view: Float[Array, ""] | None = eqx.field(converter=optional_scalar("field_of_view"))
-    jitter: Float[Array, ""] = eqx.field(converter=scalar("jitter"))
-    efficiency: Float[Array, "..."] = eqx.field(converter=array("efficiency"))
+    position: Float[Array | np.ndarray, " axes"] = quantity(unit="m", converter=_position)
+    # Plausible from less than a hundredth of any beam to the whole half-space.
+    field_of_view: Float[Array, ""] | None = quantity(
+        unit=Magnitude("mrad", 5e-5, 3.2e3, {"rad": 1e3, "urad": 1e-3}),
+        range=POSITIVE,
+        converter=as_optional_scalar,
+    )
+    jitter: Float[Array, ""] = quantity(unit=NANOSECONDS, range=NOT_NEGATIVE, converter=as_scalar)
+    efficiency: Float[Array, "..."] = quantity(range=Range(0.0, 1.0, low_open=True), converter=as_array)
     receiver: Receiver | PhotonCounter
     scan: AbstractScan | None = eqx.field(static=True)
-
-    _ranges: ClassVar = {
-        "wavelength": Range(0.0, low_open=True, increasing=True),
-        "altitude": Range(0.0, low_open=True),
-        "divergence": Range(0.0, _MAX_DIVERGENCE),
-        "aperture": Range(0.0, low_open=True),
-        "zenith": Range(0.0, _MAX_ZENITH, mirrored=True),
-        "azimuth": Range(),
-        "energy": Range(0.0, low_open=True),
-        "sampling_interval": Range(0.0, low_open=True),
-        "position": Range(),
-        "field_of_view": Range(0.0, low_open=True),
-        "jitter": Range(0.0),
-        "efficiency": Range(0.0, 1.0, low_open=True),
-    }
 
     # Not the one of the dataclass: `sensor` is an argument, and a property that every lidar has.
     def __init__(
@@ -281,7 +298,6 @@ class Lidar(eqx.Module):
                     f"{field} has shape {value.shape}; admissible is one number or one per wavelength, "
                     f"{self.wavelength.shape}"
                 )
-        warn_units(self)
 
     def __str__(self) -> str:
         return object_text(self, {"position": "sensor"} if self.has_sensor_position else None)
@@ -334,9 +350,8 @@ class Lidar(eqx.Module):
 
     @property
     def ranges(self) -> dict[str, Range]:
-        """Admissible ranges by field. A beam that is to meet the reference plane must go down."""
-        highest = STRAIGHT_UP if self.has_sensor_position else _MAX_ZENITH
-        return {**self._ranges, "zenith": Range(0.0, highest, mirrored=True)}
+        """Admissible range of the zenith. A beam that is to meet the reference plane must go down."""
+        return {} if self.has_sensor_position else {"zenith": Range(0.0, _MAX_ZENITH, mirrored=True)}
 
     @property
     def range_to_reference(self) -> Float[Array, ""]:

@@ -27,7 +27,7 @@ arrivals between dead times.
 
 import os
 from collections.abc import Iterator
-from typing import Any, ClassVar, NamedTuple, final
+from typing import Any, NamedTuple, final
 
 import equinox as eqx
 import jax
@@ -37,15 +37,16 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxlidar._constants import PLANCK_TIMES_LIGHT, SPEED_OF_LIGHT
 from jaxlidar._fields.checks import (
-    array,
+    as_array,
+    as_optional_array,
+    as_scalar,
     check_integer,
     check_key,
     check_range,
     concrete,
     kind_of,
-    scalar,
 )
-from jaxlidar._fields.ranges import FRACTION, Range, check_ranges
+from jaxlidar._fields.ranges import FRACTION, NOT_NEGATIVE, check_ranges, quantity
 from jaxlidar._not_kept import check_kept
 from jaxlidar._registry import save_result
 
@@ -58,10 +59,6 @@ MAX_NEGATIVE_FRACTION = 0.01
 _BLOCK_SIZE = 2_000_000
 # Above this expectation a Poisson count is drawn as a normal variable (skewness below 1e-3).
 _POISSON_MAX = 1e6
-
-
-def _window(x: Any) -> Float[Array, "..."] | None:
-    return None if x is None else array("window")(x)
 
 
 @final
@@ -97,21 +94,13 @@ class PhotonCounter(eqx.Module):
     """
 
     pixels: int = eqx.field(static=True, default=16)
-    dead_time: Float[Array, ""] = eqx.field(converter=scalar("dead_time"), default=3.2)
-    detection_probability: Float[Array, "..."] = eqx.field(
-        converter=array("detection_probability"), default=1.0
+    dead_time: Float[Array, ""] = quantity(unit="ns", range=NOT_NEGATIVE, converter=as_scalar, default=3.2)
+    detection_probability: Float[Array, "..."] = quantity(range=FRACTION, converter=as_array, default=1.0)
+    background_rate: Float[Array, "..."] = quantity(
+        unit="1/s", range=NOT_NEGATIVE, converter=as_array, default=0.0
     )
-    background_rate: Float[Array, "..."] = eqx.field(converter=array("background_rate"), default=0.0)
-    jitter: Float[Array, ""] = eqx.field(converter=scalar("jitter"), default=0.0)
-    window: Float[Array, "..."] | None = eqx.field(converter=_window, default=None)
-
-    ranges: ClassVar = {
-        "dead_time": Range(0.0),
-        "detection_probability": FRACTION,
-        "background_rate": Range(0.0),
-        "jitter": Range(0.0),
-        "window": Range(),
-    }
+    jitter: Float[Array, ""] = quantity(unit="ns", range=NOT_NEGATIVE, converter=as_scalar, default=0.0)
+    window: Float[Array, "..."] | None = quantity(unit="ns", converter=as_optional_array, default=None)
 
     def __check_init__(self):
         check_integer("pixels", self.pixels)

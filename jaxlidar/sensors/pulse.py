@@ -29,7 +29,7 @@ Every formula and its derivatives stay finite at zero width and zero jitter, whe
 import abc
 import math
 from collections.abc import Sequence
-from typing import ClassVar, final
+from typing import final
 
 import equinox as eqx
 import jax
@@ -38,8 +38,8 @@ import numpy as np
 from jax.scipy.special import erfc
 from jaxtyping import Array, ArrayLike, Float
 
-from jaxlidar._fields.checks import as_array, as_scalar, check_range, concrete, scalar, warn_units
-from jaxlidar._fields.ranges import Range, check_ranges
+from jaxlidar._fields.checks import as_array, as_scalar, check_range, concrete
+from jaxlidar._fields.ranges import NANOSECONDS, NOT_NEGATIVE, Range, check_ranges, quantity
 
 _FWHM_PER_SIGMA = 2 * math.sqrt(2 * math.log(2))
 # Extents of `support` in standard deviations and in mean lives. A normal variable lies outside +-5.5 sigma
@@ -151,13 +151,10 @@ class GaussianPulse(AbstractPulse):
     0.500
     """
 
-    fwhm: Float[Array, ""] = eqx.field(converter=scalar("fwhm"), default=6.0)
-
-    ranges: ClassVar = {"fwhm": Range(0.0)}
+    fwhm: Float[Array, ""] = quantity(unit=NANOSECONDS, range=NOT_NEGATIVE, converter=as_scalar, default=6.0)
 
     def __check_init__(self):
         check_ranges(self)
-        warn_units(self)
 
     def cumulative(self, t: ArrayLike, jitter: ArrayLike = 0.0) -> Float[Array, "..."]:
         return _normal_cdf(_z_score(as_array(t, "t"), _safe_hypot(self.std, as_scalar(jitter, "jitter"))))
@@ -198,13 +195,12 @@ class RectangularPulse(AbstractPulse):
     1.732 ns, 0.75 of the energy by 1.5 ns
     """
 
-    length: Float[Array, ""] = eqx.field(converter=scalar("length"), default=6.0)
-
-    ranges: ClassVar = {"length": Range(0.0)}
+    length: Float[Array, ""] = quantity(
+        unit=NANOSECONDS, range=NOT_NEGATIVE, converter=as_scalar, default=6.0
+    )
 
     def __check_init__(self):
         check_ranges(self)
-        warn_units(self)
 
     def cumulative(self, t: ArrayLike, jitter: ArrayLike = 0.0) -> Float[Array, "..."]:
         return _segment_integrals(as_array(t, "t"), self.length, jnp.abs(as_scalar(jitter, "jitter")))[0]
@@ -249,14 +245,11 @@ class ExponentiallyModifiedGaussianPulse(AbstractPulse):
     0.570 of the energy, standard deviation 2.371 ns
     """
 
-    fwhm: Float[Array, ""] = eqx.field(converter=scalar("fwhm"))
-    decay: Float[Array, ""] = eqx.field(converter=scalar("decay"))
-
-    ranges: ClassVar = {"fwhm": Range(0.0), "decay": Range(0.0)}
+    fwhm: Float[Array, ""] = quantity(unit=NANOSECONDS, range=NOT_NEGATIVE, converter=as_scalar)
+    decay: Float[Array, ""] = quantity(unit=NANOSECONDS, range=NOT_NEGATIVE, converter=as_scalar)
 
     def __check_init__(self):
         check_ranges(self)
-        warn_units(self)
 
     def cumulative(self, t: ArrayLike, jitter: ArrayLike = 0.0) -> Float[Array, "..."]:
         sigma = _safe_hypot(self.fwhm / _FWHM_PER_SIGMA, as_scalar(jitter, "jitter"))
@@ -308,10 +301,8 @@ class SampledPulse(AbstractPulse):
     centroid 3.333 ns, standard deviation 1.700 ns
     """
 
-    time: Float[Array, " samples"]
-    samples: Float[Array, " samples"]
-
-    ranges: ClassVar = {"time": Range(increasing=True), "samples": Range(0.0)}
+    time: Float[Array, " samples"] = quantity(unit="ns", range=Range(increasing=True))
+    samples: Float[Array, " samples"] = quantity(range=NOT_NEGATIVE)
 
     def __init__(self, time: ArrayLike | Sequence[ArrayLike], power: ArrayLike | Sequence[ArrayLike]):
         self.time = as_array(time, "time")

@@ -13,7 +13,7 @@ the detected energy E of a sample, the background b and the photon energy e = h 
 
 import math
 from collections.abc import Callable, Sequence
-from typing import Any, ClassVar, TypeAlias, final
+from typing import Any, TypeAlias, final
 
 import equinox as eqx
 import jax
@@ -25,6 +25,7 @@ from jaxlidar._constants import PLANCK_TIMES_LIGHT
 from jaxlidar._fields.checks import (
     as_array,
     as_numpy,
+    as_optional_scalar,
     as_scalar,
     check_choice,
     check_flag,
@@ -36,11 +37,9 @@ from jaxlidar._fields.checks import (
     check_range,
     concrete,
     even_step,
-    optional_scalar,
-    scalar,
     warn_unit,
 )
-from jaxlidar._fields.ranges import Range, check_ranges
+from jaxlidar._fields.ranges import NANOMETRES, NOT_NEGATIVE, POSITIVE, check_ranges, quantity
 from jaxlidar._jax.products import einsum
 from jaxlidar._not_kept import check_kept
 from jaxlidar.sensors.photon_counter import (
@@ -53,6 +52,7 @@ from jaxlidar.sensors.photon_counter import (
 # sampler of JAX weighs terms of the size m ln m in single precision, whatever the precision of the draws:
 # from some 1e5 photons on they are wrong by percents of their variance.
 _POISSON_MAX = 1e4
+_ENERGY = "J per sample"
 
 Wavelengths: TypeAlias = ArrayLike | Sequence[ArrayLike]
 # A function of a key, expected energies and wavelengths, which gives noisy samples.
@@ -92,20 +92,21 @@ class Receiver(eqx.Module):
     ['0.0e+00', '1.0e-15', '3.0e-15']
     """
 
-    detection_threshold: Float[Array, ""] = eqx.field(converter=scalar("detection_threshold"), default=0.0)
-    saturation: Float[Array, ""] | None = eqx.field(converter=optional_scalar("saturation"), default=None)
+    detection_threshold: Float[Array, ""] = quantity(
+        unit=_ENERGY, range=NOT_NEGATIVE, converter=as_scalar, default=0.0
+    )
+    saturation: Float[Array, ""] | None = quantity(
+        unit=_ENERGY, range=POSITIVE, converter=as_optional_scalar, default=None
+    )
     bits: int | None = eqx.field(static=True, default=None)
-    background: Float[Array, ""] = eqx.field(converter=scalar("background"), default=0.0)
+    background: Float[Array, ""] = quantity(
+        unit=_ENERGY, range=NOT_NEGATIVE, converter=as_scalar, default=0.0
+    )
     photon_noise: bool = eqx.field(static=True, default=True)
-    electronic_noise: Float[Array, ""] = eqx.field(converter=scalar("electronic_noise"), default=0.0)
+    electronic_noise: Float[Array, ""] = quantity(
+        unit=_ENERGY, range=NOT_NEGATIVE, converter=as_scalar, default=0.0
+    )
     window: str = eqx.field(static=True, default="fixed")
-
-    ranges: ClassVar = {
-        "detection_threshold": Range(0.0),
-        "saturation": Range(0.0, low_open=True),
-        "background": Range(0.0),
-        "electronic_noise": Range(0.0),
-    }
 
     def __check_init__(self):
         check_flag("photon_noise", self.photon_noise)
@@ -184,7 +185,7 @@ def record(
     if energy.ndim < 2:
         raise ValueError(f"energy has shape {energy.shape}; admissible is (..., wavelengths, bins)")
     check_range("wavelength", wavelength, 0.0, low_open=True)
-    warn_unit("wavelength", wavelength)
+    warn_unit("wavelength", wavelength, NANOMETRES)
     if wavelength.shape not in ((), (1,), energy.shape[-2:-1]):
         raise ValueError(
             f"wavelength has shape {wavelength.shape}; admissible is one number, or one for each of the "

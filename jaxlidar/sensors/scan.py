@@ -19,10 +19,12 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
-from jaxlidar._fields.checks import as_numpy, check_choice, check_number, concrete, warn_unit
+from jaxlidar._fields.checks import Magnitude, as_numpy, check_choice, check_number, concrete, warn_unit
 
 # Largest angle between a beam and the vertical, degrees.
 MAX_ZENITH = 89.0
+# Smaller half angles are narrower than any in use.
+_HALF_ANGLE = Magnitude("degrees", 0.8, 90.0, {"rad": 180.0 / np.pi})
 
 
 def _as_float(x: Any) -> Any:
@@ -170,7 +172,7 @@ def _check_pattern(half_angle: Any, field: str, rate: Any) -> None:
     check_number("half_angle", half_angle, 0.0, MAX_ZENITH, low_open=True)
     # Smaller ones than of any radian are deliberate, as of a beam that stands still.
     if float(half_angle) > 0.01:
-        warn_unit("half_angle", half_angle)
+        warn_unit("half_angle", half_angle, _HALF_ANGLE)
     check_number(field, rate, 0.0, low_open=True)
 
 

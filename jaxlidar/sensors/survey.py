@@ -24,6 +24,7 @@ import numpy as np
 from jaxtyping import Float, Int, PRNGKeyArray
 
 from jaxlidar._fields.checks import (
+    Magnitude,
     Numbers,
     as_numpy,
     check_integer,
@@ -51,6 +52,8 @@ _SPACING_TOLERANCE = 1e-6
 MAX_FLIGHT_LINE = 2**16 - 1
 # Bytes of a shot while a survey is made: its position and direction, and the terms of their sums.
 _BYTES_PER_SHOT = 100.0
+# Plausible from one pulse in two seconds.
+_PULSE_RATE = Magnitude("1/s", 0.5, np.inf, {"MHz": 1e6, "kHz": 1e3})
 # Fields that are known of all shots, or of none.
 _OPTIONAL_ROWS = ("gps_time", "scan_angle", "attitude")
 # More positions along a line than fit into any memory.
@@ -593,7 +596,7 @@ class Survey(eqx.Module):
         first, forward, _, length = _line(start, end)
         check_number("speed", speed, 0.0, low_open=True)
         check_number("pulse_rate", pulse_rate, 0.0, low_open=True)
-        warn_unit("pulse_rate", pulse_rate)
+        warn_unit("pulse_rate", pulse_rate, _PULSE_RATE)
         check_number("gps_time", gps_time)
         shots = _count_along(length, float(speed) / float(pulse_rate))
         rate = f"pulse_rate = {float(pulse_rate):g} at speed = {float(speed):g}"
@@ -676,7 +679,7 @@ class Survey(eqx.Module):
             check_kind("trajectory", strip, Trajectory, "a Trajectory, or a sequence of them")
         if pulse_rate is not None:
             check_number("pulse_rate", pulse_rate, 0.0, low_open=True)
-            warn_unit("pulse_rate", pulse_rate)
+            warn_unit("pulse_rate", pulse_rate, _PULSE_RATE)
         scanner_turn = rotation_matrix(*three_numbers("mounting", mounting))
         arm = three_numbers("lever_arm", lever_arm)
         durations = [float(strip.time[-1] - strip.time[0]) for strip in strips]

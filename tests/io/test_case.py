@@ -14,7 +14,7 @@ import pytest
 from jaxtyping import Array, Float
 
 import jaxlidar as jl
-from jaxlidar.io.kinds import UNITS, UNITS_OF, arguments_of, kinds
+from jaxlidar.io.kinds import arguments_of, kinds
 from jaxlidar.optics.coefficients import shipped
 
 SCENES = sorted((Path(__file__).resolve().parents[2] / "examples" / "scenes").glob("*.toml"))
@@ -185,8 +185,7 @@ def test_every_quantity_has_a_unit_or_is_a_pure_number():
     }
     for name, kind in kinds().items():
         for argument in numeric_arguments(kind):
-            has_unit = argument in UNITS or (kind, argument) in UNITS_OF
-            assert has_unit or argument in pure, f"{name}.{argument}"
+            assert arguments_of(kind)[argument].unit or argument in pure, f"{name}.{argument}"
 
 
 def test_key_and_arguments_of_a_case_are_read_as_they_were_written(tmp_path):
