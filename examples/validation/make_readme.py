@@ -15,7 +15,7 @@ FOLDER = Path(__file__).resolve().parent
 RESULTS = FOLDER / "results"
 # The order of the page: exact references first, then other codes, measurements and records.
 ORDER = (
-    *("mpmath_plate", "prosail_leaves", "discrete_ordinates", "rami4pilps"),
+    *("mpmath_plate", "prosail_leaves", "prosail_canopy", "discrete_ordinates", "rami4pilps"),
     *("rami_reflectance", "rami_waveforms"),
     *("mitransient_crown", "mitransient_meshes", "mcx_crown", "standard_errors"),
     *("leaf_databases", "recorded_gedi", "recorded_posterior", "recorded_neon", "recorded_riegl"),
@@ -74,13 +74,13 @@ def costs(record: dict) -> tuple[str, ...]:
     return text, table(record["costs"], columns)
 
 
-def own_table(record: dict) -> tuple[str, ...]:
-    """Return the table that a script has written into its record, with its text."""
-    if "table" not in record:
-        return ()
-    own = record["table"]
-    columns = {heading: lambda line, i=i: line[i] for i, heading in enumerate(own["headings"])}
-    return " ".join(own["text"].split()), table(own["lines"], columns)
+def own_tables(record: dict) -> tuple[str, ...]:
+    """Return the tables that a script has written into its record, each after its text."""
+    paragraphs = []
+    for own in record.get("tables", ()):
+        columns = {heading: lambda line, i=i: line[i] for i, heading in enumerate(own["headings"])}
+        paragraphs += [" ".join(own["text"].split()), table(own["lines"], columns)]
+    return tuple(paragraphs)
 
 
 def section(script: str, record: dict) -> str:
@@ -93,7 +93,7 @@ def section(script: str, record: dict) -> str:
         f"![{record['title']}](results/{script}.png)",
         record["seen"],
         *costs(record),
-        *own_table(record),
+        *own_tables(record),
         f"Unchecked: {record['unchecked']}",
         f"{record['date']}, {software}, jax {record['machine']['jax']}, "
         f"Python {record['machine']['python']}{code}.",

@@ -125,7 +125,7 @@ def main(argv=None):
         size=(3.7 * arguments.canopies, 6.0),
         photons=arguments.photons,
         code="reference by Eradiate 25c35e4 (LGPL 3), data d258b6f",
-        table=gap_table(gaps),
+        tables=[gap_table(gaps)],
         gaps=gaps,
     )
 

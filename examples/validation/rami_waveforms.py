@@ -218,7 +218,7 @@ def main(argv=None):
         of_others=True,
         size=(4.0 * arguments.canopies, 7.0),
         photons=arguments.photons,
-        table={"text": TABLE, "headings": HEADINGS, "lines": lines},
+        tables=[{"text": TABLE, "headings": HEADINGS, "lines": lines}],
     )
     write_columns(arguments.out / "rami_waveforms.csv", profiles)
     return record

@@ -268,17 +268,19 @@ def main(argv: Sequence[str] | None = None) -> dict:
         unchecked="""An error that all keys share, as one of a wrong model, is not seen by their scatter; the
         other comparisons look for it.""",
         draw=draw,
-        table={
-            "text": f"Scatter over stated errors, from {arguments.keys} keys.",
-            "headings": [
-                "estimate",
-                "values",
-                "root mean square of z",
-                "within two",
-                "deviations over errors",
-            ],
-            "lines": lines,
-        },
+        tables=[
+            {
+                "text": f"Scatter over stated errors, from {arguments.keys} keys.",
+                "headings": [
+                    "estimate",
+                    "values",
+                    "root mean square of z",
+                    "within two",
+                    "deviations over errors",
+                ],
+                "lines": lines,
+            }
+        ],
         keys=arguments.keys,
     )
 

@@ -111,6 +111,22 @@ def test_leaves_by_prosail(run):
 
 
 @pytest.mark.slow
+def test_canopies_by_prosail(run):
+    few = ("--indices", "1", "--sizes", "1")
+    assert holds(run("prosail_canopy", *few, "--realisations", "3"))
+
+    def plant(module):
+        sail, exact = module.foursail, module.random_leaves
+        # The sixth is the leaf area index.
+        module.foursail = lambda *inputs: sail(*inputs[:5], 1.05 * inputs[5], *inputs[6:])
+        module.random_leaves = lambda sun, view, area: exact(sun, view, 2 * area)
+
+    wrong = run("prosail_canopy", *few, "--realisations", "2", "--photons", "8192", planted=plant)
+    assert not holds(wrong, "leaves without size")
+    assert not holds(wrong, "leaves with a size")
+
+
+@pytest.mark.slow
 def test_slabs(run):
     assert holds(run("discrete_ordinates", "--slabs", "5", "--rtol", "0.003"))
 
