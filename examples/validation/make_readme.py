@@ -15,7 +15,8 @@ FOLDER = Path(__file__).resolve().parent
 RESULTS = FOLDER / "results"
 # The order of the page: exact references first, then other codes, measurements and records.
 ORDER = (
-    *("mpmath_plate", "prosail_leaves", "prosail_canopy", "discrete_ordinates", "rami4pilps"),
+    *("mpmath_plate", "prosail_leaves", "prosail_canopy", "discrete_ordinates"),
+    *("flight_times", "rami4pilps"),
     *("rami_reflectance", "rami_waveforms"),
     *("mitransient_crown", "mitransient_meshes", "mcx_crown", "standard_errors"),
     *("leaf_databases", "recorded_gedi", "recorded_posterior", "recorded_neon", "recorded_riegl"),

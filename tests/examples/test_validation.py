@@ -212,6 +212,21 @@ def test_waveforms_over_discs(run):
     assert not holds(wrong, "in all")
 
 
+@pytest.mark.slow
+def test_times_of_flight(run):
+    """They hold by their errors; not with 1 % more extinction."""
+    assert holds(run("flight_times"))
+
+    def plant(module):
+        exact = module.exact
+        module.exact = lambda edges: exact(1.01 * edges)
+
+    wrong = run("flight_times", "--photons", "65536", planted=plant)
+    assert not holds(wrong, "order 1")
+    assert not holds(wrong, "order 2")
+    assert not holds(wrong, "all orders")
+
+
 def skip_without(package):
     """Skip the test if a package is missing."""
     # Not imported: mitransient refuses to be, before its script has chosen a variant of Mitsuba.
