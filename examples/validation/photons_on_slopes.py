@@ -258,7 +258,7 @@ def main(argv=None):
         draw=draw,
         size=(9.0, 3.8),
         classes=classes,
-        table=table_of(classes),
+        tables=[table_of(classes)],
     )
 
 
