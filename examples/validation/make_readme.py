@@ -18,8 +18,9 @@ ORDER = (
     *("mpmath_plate", "prosail_leaves", "prosail_canopy", "discrete_ordinates"),
     *("flight_times", "rami4pilps"),
     *("rami_reflectance", "rami_waveforms"),
-    *("mitransient_crown", "mitransient_meshes", "mcx_crown", "standard_errors"),
-    *("leaf_databases", "recorded_gedi", "recorded_posterior", "recorded_neon", "recorded_riegl"),
+    *("mitransient_crown", "mitransient_meshes", "mcx_crown", "multiscatter_slabs"),
+    *("standard_errors", "leaf_databases", "recorded_gedi", "recorded_posterior"),
+    *("recorded_neon", "recorded_riegl"),
     *("recorded_flat", "recorded_lvis", "recorded_clouds", "photons_on_slopes", "recorded_photons"),
 )
 

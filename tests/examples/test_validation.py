@@ -3,6 +3,7 @@
 import dataclasses
 import importlib.util
 import json
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -257,6 +258,27 @@ def test_meshes_by_mitransient(run):
 
     wrong = run("mitransient_meshes", "--repeats", "4", planted=plant)
     assert not holds(wrong, "returned in all")
+
+
+@pytest.mark.slow
+def test_fields_of_view_by_multiscatter(run):
+    """Within 20 % where light diffuses, as photons in NumPy everywhere; not with half the field of view."""
+    program = shutil.which("multiscatter")
+    if program is None:
+        pytest.skip("multiscatter is not on the path")
+    record = run("multiscatter_slabs", program, "--photons", "65536")
+    assert holds(record, "samples of the tail")
+    for slab in ("isotropic, optical depth 12", "forward, optical depth 80"):
+        assert holds(record, f"late tail: {slab}")
+
+    def plant(module):
+        exact = module.simulate_slab
+        module.SLABS = dict(list(module.SLABS.items())[:1])
+        module.simulate_slab = lambda tau, g, radius, *rest: exact(tau, g, 0.5 * radius, *rest)
+
+    wrong = run("multiscatter_slabs", program, "--photons", "65536", planted=plant)
+    assert not holds(wrong, "late tail")
+    assert not holds(wrong, "samples of the tail")
 
 
 @pytest.mark.slow
