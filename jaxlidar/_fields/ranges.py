@@ -111,10 +111,10 @@ def _ranges(module: Any) -> Mapping[str, Range]:
     return _stated(module, "range") | getattr(module, "ranges", {})
 
 
-def _stated(module: Any, property: str) -> dict[str, Any]:
-    """Return what `quantity` states for the fields of a module: `property` is "unit" or "range"."""
+def _stated(module: Any, key: str) -> dict[str, Any]:
+    """Return what `quantity` states for the fields of a module: `key` is "unit" or "range"."""
     fields = getattr(module, "__dataclass_fields__", {}).values()
-    return {field.name: field.metadata[property] for field in fields if property in field.metadata}
+    return {field.name: field.metadata[key] for field in fields if key in field.metadata}
 
 
 def check_ranges(module: Any) -> None:

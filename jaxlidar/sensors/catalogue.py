@@ -98,9 +98,9 @@ def instrument(name: str, path: str | os.PathLike[str] | None = None) -> Lidar:
     Its scan pattern is `lidar.scan` (None where its pattern is none of an airborne mirror), its receiver
     `lidar.receiver`, and the standard deviation of its noise in J per sample `lidar.noise` (None where it
     is not published). `Lidar.at` places it by its sensor, as on a drone or a tripod; other fields change with
-    `dataclasses.replace`. `instrument_sources` says which
-    numbers are published, and where; those that are not are assumed. Numbers of commercial scanners have not
-    been compared with their data sheets line by line yet: check those of yours.
+    `dataclasses.replace`. `instrument_sources` says which numbers are published, and where; those that are
+    not are assumed. Numbers of commercial scanners have not been compared with their data sheets line by line
+    yet: check those of yours.
 
     **Arguments:**
 
