@@ -9,9 +9,9 @@ For laws, pulses and surfaces of your own, and for packages on top such as `inve
   times or heights, and refuses uneven ones. `warn_user` warns at the line of the user's code.
 - directions: a `Vec` is a tuple of three arrays, x, y and z; `dot`, `scale`, `add`, `normalise`; `polar` and
   `from_frame` make directions about an axis, `cosine_direction` draws one by the cosine law.
-- ranges: a class states them by field, `ranges = {"slope": Range(0.0, 90.0)}`; its constructor calls
-  `check_ranges`; where JAX is tracing, `inadmissible` detects values outside of them and `reasons` tells
-  which.
+- ranges: `quantity` makes a field with its unit, `Range` and conversion, by `as_array` and others, such as
+  `as_optional_scalar`; the constructor calls `check_ranges`; where JAX is tracing, `inadmissible` detects
+  values outside of them and `reasons` tells which.
 - `check_kinds` refuses objects that are not a lidar and a scene.
 - `fingerprint` is a hash of everything that a result depends on, to compare with that of a stored result.
 - `barrier` is an optimisation barrier: the compiler computes its arguments once, instead of again in each
@@ -26,6 +26,8 @@ For laws, pulses and surfaces of your own, and for packages on top such as `inve
 from jaxlidar._fields.checks import (
     as_array,
     as_numpy,
+    as_optional_array,
+    as_optional_scalar,
     as_scalar,
     check_index,
     check_integer,
@@ -38,7 +40,7 @@ from jaxlidar._fields.checks import (
     even_step,
     warn_user,
 )
-from jaxlidar._fields.ranges import Range, check_ranges, inadmissible, reasons
+from jaxlidar._fields.ranges import Range, check_ranges, inadmissible, quantity, reasons
 from jaxlidar._fingerprint import fingerprint
 from jaxlidar._jax.one_function import barrier
 from jaxlidar._jax.products import einsum, matmul, tensordot
@@ -69,6 +71,8 @@ __all__ = [
     "along",
     "as_array",
     "as_numpy",
+    "as_optional_array",
+    "as_optional_scalar",
     "as_scalar",
     "barrier",
     "check_index",
@@ -92,6 +96,7 @@ __all__ = [
     "normalise",
     "outcomes",
     "polar",
+    "quantity",
     "reasons",
     "scale",
     "side_by_side",

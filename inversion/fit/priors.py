@@ -4,13 +4,25 @@ A normal prior is a plain pair (mean, standard deviation) of `Unknown`. `inversi
 all priors of a fit of one waveform into residuals, `inversion.scene.map_priors` those of maps.
 """
 
+from functools import partial
 from typing import final
 
 import equinox as eqx
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxlidar.extend import as_array, as_scalar, check_integer, check_range
+from jaxlidar.extend import (
+    Range,
+    as_array,
+    as_optional_array,
+    as_optional_scalar,
+    as_scalar,
+    check_integer,
+    check_ranges,
+    quantity,
+)
+
+_POSITIVE = Range(0.0, low_open=True)
 
 
 @final
@@ -35,12 +47,11 @@ class LogNormal(eqx.Module):
     0.3
     """
 
-    median: Float[Array, "..."] = eqx.field(converter=lambda x: as_array(x, "median"))
-    spread: Float[Array, "..."] = eqx.field(converter=lambda x: as_array(x, "spread"))
+    median: Float[Array, "..."] = quantity(range=_POSITIVE, converter=as_array)
+    spread: Float[Array, "..."] = quantity(range=_POSITIVE, converter=as_array)
 
     def __check_init__(self):
-        check_range("median", self.median, 0.0, low_open=True)
-        check_range("spread", self.spread, 0.0, low_open=True)
+        check_ranges(self)
 
 
 @final
@@ -88,24 +99,15 @@ class Smooth(eqx.Module):
     [1.   0.78 0.48]
     """
 
-    scale: Float[Array, ""] = eqx.field(converter=lambda x: as_scalar(x, "scale"))
-    spacing: Float[Array, ""] = eqx.field(
-        converter=lambda x: as_scalar(x, "spacing"), default=1.0, kw_only=True
+    scale: Float[Array, ""] = quantity(range=_POSITIVE, converter=as_scalar)
+    spacing: Float[Array, ""] = quantity(range=_POSITIVE, converter=as_scalar, default=1.0, kw_only=True)
+    strength: Float[Array, ""] | None = quantity(
+        range=_POSITIVE, converter=as_optional_scalar, default=None, kw_only=True
     )
-    strength: Float[Array, ""] | None = eqx.field(
-        converter=lambda x: None if x is None else as_scalar(x, "strength"), default=None, kw_only=True
-    )
-    mean: Float[Array, "..."] | None = eqx.field(
-        converter=lambda x: None if x is None else as_array(x, "mean"), default=None, kw_only=True
-    )
+    mean: Float[Array, "..."] | None = quantity(converter=as_optional_array, default=None, kw_only=True)
 
     def __check_init__(self):
-        check_range("scale", self.scale, 0.0, low_open=True)
-        check_range("spacing", self.spacing, 0.0, low_open=True)
-        if self.strength is not None:
-            check_range("strength", self.strength, 0.0, low_open=True)
-        if self.mean is not None:
-            check_range("mean", self.mean)
+        check_ranges(self)
 
     def correlation(self, layers: int) -> Float[np.ndarray, "layers layers"]:
         """Correlation between layers, without the common level.
@@ -157,9 +159,10 @@ class MarkovField(eqx.Module):
     [0.1 0.1 0.3]
     """
 
-    difference: Float[Array, "..."] = eqx.field(converter=lambda x: as_array(x, "difference"))
-    mean: Float[Array, ""] | None = eqx.field(
-        converter=lambda x: None if x is None else as_scalar(x, "mean"), default=None, kw_only=True
+    # Infinity is admissible, so that it states no range.
+    difference: Float[Array, "..."] = eqx.field(converter=partial(as_array, field="difference"))
+    mean: Float[Array, ""] | None = quantity(
+        range=_POSITIVE, converter=as_optional_scalar, default=None, kw_only=True
     )
 
     def __check_init__(self):
@@ -168,8 +171,7 @@ class MarkovField(eqx.Module):
             raise ValueError(
                 f"difference has the shape {difference.shape}; admissible is one number, or one for each axis"
             )
-        # Written so that NaN is refused; infinity is admissible, so that `check_range` is not.
+        # Written so that NaN is refused.
         if not np.all(difference > 0):
             raise ValueError(f"difference = {difference} is outside the admissible range (0, inf]")
-        if self.mean is not None:
-            check_range("mean", self.mean, 0.0, low_open=True)
+        check_ranges(self)

@@ -19,22 +19,21 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from jaxlidar.extend import (
-    as_array,
+    Range,
     as_numpy,
+    as_optional_array,
     as_scalar,
     check_integer,
     check_number,
     check_range,
+    check_ranges,
+    quantity,
 )
 
 # Names of the unknowns that a recorder adds to a fit.
 WIDTH_NAME, DELAY_NAME, OFFSET_NAME = "receiver width", "delay", "offset"
 
 BoundPair = tuple[float, float]
-
-
-def _optional_impulse(x: Any) -> Array | None:
-    return None if x is None else as_array(x, "impulse")
 
 
 @final
@@ -83,11 +82,13 @@ class Recorder(eqx.Module):
 
     width: BoundPair | None = eqx.field(static=True, default=None)
     delay: BoundPair | None = eqx.field(static=True, default=None, kw_only=True)
-    impulse: Float[Array, " lags"] | None = eqx.field(converter=_optional_impulse, default=None)
+    impulse: Float[Array, " lags"] | None = quantity(converter=as_optional_array, default=None)
     offset: BoundPair | None = eqx.field(static=True, default=None)
     interleaved: int = eqx.field(static=True, default=1)
-    pulse_noise: Float[Array, ""] = eqx.field(converter=lambda x: as_scalar(x, "pulse_noise"), default=0.0)
-    correlation: Float[Array, ""] = eqx.field(converter=lambda x: as_scalar(x, "correlation"), default=0.0)
+    pulse_noise: Float[Array, ""] = quantity(range=Range(0.0), converter=as_scalar, default=0.0)
+    correlation: Float[Array, ""] = quantity(
+        range=Range(0.0, 1.0, high_open=True), converter=as_scalar, default=0.0
+    )
 
     def __check_init__(self):
         for field, low in (("width", 0.0), ("delay", -np.inf), ("offset", -np.inf)):
@@ -95,12 +96,10 @@ class Recorder(eqx.Module):
             if bounds is not None:
                 _check_bounds(field, bounds, low)
         check_integer("interleaved", self.interleaved)
-        check_range("pulse_noise", self.pulse_noise, 0.0)
-        check_range("correlation", self.correlation, 0.0, 1.0, high_open=True)
+        check_ranges(self)
         if self.interleaved > 1 and self.offset is None:
             raise ValueError(f"interleaved = {self.interleaved}, but offset = None: bounds of the offsets")
         if self.impulse is not None:
-            check_range("impulse", self.impulse)
             if self.impulse.ndim != 1 or self.impulse.size % 2 == 0:
                 raise ValueError(
                     f"impulse has the shape {self.impulse.shape}; admissible is (lags,) with an odd number"

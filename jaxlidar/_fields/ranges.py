@@ -38,12 +38,10 @@ class Range(NamedTuple):
 
     **Example:** the ranges of a module of your own.
 
-    >>> from typing import ClassVar
     >>> import equinox as eqx, jax
-    >>> from jaxlidar.extend import Range, check_ranges, inadmissible
+    >>> from jaxlidar.extend import Range, as_scalar, check_ranges, inadmissible, quantity
     >>> class Hill(eqx.Module):
-    ...     slope: jax.Array | float
-    ...     ranges: ClassVar = {"slope": Range(0.0, 90.0, high_open=True)}
+    ...     slope: jax.Array = quantity(range=Range(0.0, 90.0, high_open=True), converter=as_scalar)
     ...
     ...     def __check_init__(self):
     ...         check_ranges(self)
