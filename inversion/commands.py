@@ -22,8 +22,8 @@ from inversion.fit.unknowns import Unknown
 from inversion.metrics.gedi_table import gedi_table
 from jaxlidar.cli.constants import INTERRUPTED, SUCCESS
 from jaxlidar.cli.shared import ResultPath, save_figure
-from jaxlidar.io.store import remove_store, store_beside
-from jaxlidar.io.tables import TABLE_FORMATS
+from jaxlidar.formats.tables import TABLE_FORMATS
+from jaxlidar.results.store import remove_store, store_beside
 
 # Seconds between lines of progress in a log file.
 _LOG_SECONDS = 5.0

@@ -84,7 +84,6 @@ from jaxlidar._fingerprint import version_of
 from jaxlidar._jax.compilation_cache import compilation_cache
 from jaxlidar._jax.workers import LostWorkersWarning
 from jaxlidar._registry import register_public_objects, waveform_html
-from jaxlidar.io.netcdf import open, rerun
 from jaxlidar.optics.coefficients import load_coefficients
 from jaxlidar.optics.laws import AbstractLaw, EqualAngle, Lambertian, Specular
 from jaxlidar.optics.leaf import LeafOptics
@@ -109,6 +108,7 @@ from jaxlidar.plants.tree import Tree
 from jaxlidar.plants.turtle import turtle
 from jaxlidar.plants.voxelise import voxelise, voxelise_points
 from jaxlidar.progress import Progress
+from jaxlidar.results.netcdf import open, rerun
 from jaxlidar.scenes.atmosphere import Atmosphere
 from jaxlidar.scenes.canopy import Canopy
 from jaxlidar.scenes.mesh_surface import MeshInstances, MeshSurface

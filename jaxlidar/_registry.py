@@ -1,9 +1,9 @@
 """Functions and classes that upper packages offer to lower ones.
 
 Imports go downwards only, but a few methods of lower classes do the work of an upper package: `Waveform.save`
-writes a file, which is the work of `jaxlidar.io`. The upper package registers its function here when it is
-imported, and the method looks it up when it is called. `import jaxlidar` imports all packages that register
-something, so users meet no function without a provider.
+writes a file, which is the work of `jaxlidar.results`. The upper package registers its function here when it
+is imported, and the method looks it up when it is called. `import jaxlidar` imports all packages that
+register something, so users meet no function without a provider.
 """
 
 from collections.abc import Callable, Mapping
@@ -35,17 +35,16 @@ class RegisteredFunction:
         return self._function(*args, **kwargs)
 
 
-save_result = RegisteredFunction("saving a result", "jaxlidar.io")
+save_result = RegisteredFunction("saving a result", "jaxlidar.results")
 waveform_html = RegisteredFunction("the figure of a waveform in a notebook", "jaxlidar")
 detect_returns = RegisteredFunction("detecting discrete returns", "jaxlidar.survey.waveforms")
 true_returns = RegisteredFunction("the list of true echoes", "jaxlidar.survey.waveforms")
 survey_lines = RegisteredFunction("describing the strategy of a survey", "jaxlidar.survey.choose_strategy")
-common_crs = RegisteredFunction("comparing coordinate reference systems", "jaxlidar.io.coordinates")
 shots_within = RegisteredFunction("clipping a survey to a scene", "jaxlidar.survey.coverage")
 simulate_survey = RegisteredFunction("simulating a survey", "jaxlidar.survey.simulate_many")
 
-# The public names of jaxlidar. `jaxlidar.io` finds among them the classes that a table of a TOML file can
-# stand for.
+# The public names of jaxlidar. `jaxlidar.results` finds among them the classes that a table of a TOML file
+# can stand for.
 public_objects: dict[str, Any] = {}
 
 

@@ -24,8 +24,8 @@ from inversion.fit.data import SampleNoise, neighbour_correlation
 from inversion.fit.recorder_model import RecorderModel
 from inversion.fit.retrieval import scale_unknown
 from inversion.receiver.digitiser import amplitude_table
+from jaxlidar.formats.noise import above_pedestal
 from jaxlidar.io import read_pulsewaves
-from jaxlidar.io.noise import above_pedestal
 
 COUNTS, CORRELATED = 0.9, 0.6
 STRONG, NARROWEST = (120, 200), 120

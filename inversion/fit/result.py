@@ -19,7 +19,7 @@ from inversion.fit.unknowns import BoundUnknown, bounds_by_name, flat_labels, sm
 from jaxlidar import Scene, Waveform
 from jaxlidar.extend import check_index
 from jaxlidar.io import save
-from jaxlidar.io.datasets import datasets_of, variables_by_item
+from jaxlidar.results.datasets import datasets_of, variables_by_item
 
 
 @final

@@ -56,8 +56,9 @@ from jaxlidar.extend import (
     task,
     warn_user,
 )
-from jaxlidar.io.store import ResultStore, dataset_of_rows, open_store
 from jaxlidar.progress import ProgressOption, shows_progress
+from jaxlidar.results.netcdf import store_result
+from jaxlidar.results.store import ResultStore, dataset_of_rows, open_store
 
 # Fits of a chunk of the store. A chunk of each quantity is a file: few files, and small ones to rewrite.
 _FITS_PER_CHUNK = 16
@@ -165,7 +166,10 @@ def retrieve_many(
                 n_converged = sum(fit.converged for fit in finished.summaries.values())
                 counts = len(finished.summaries), n_footprints
                 progress(Progress(*counts, perf_counter() - start_time, "fits", n_stored, n_converged))
-    return retrievals_of([finished.summaries[i] for i in range(n_footprints)], all_unknowns)
+        result = retrievals_of([finished.summaries[i] for i in range(n_footprints)], all_unknowns)
+        if store is not None and finished.are_stored:
+            store_result(store, result)
+    return result
 
 
 def _parts_of_unknowns(unknowns: list[list[BoundUnknown]]) -> dict[str, Any]:
@@ -197,6 +201,11 @@ class FinishedFits:
             for row, number in enumerate(numbers.tolist()):
                 of_fit = {name: np.asarray(array[row]) for name, array in arrays.items()}
                 self.summaries[number] = FitSummary.from_arrays(of_fit)
+
+    @property
+    def are_stored(self) -> bool:
+        """True unless the store could not be written."""
+        return not self._unwritten
 
     def add(self, number: int, summary: FitSummary) -> None:
         """Add a fit, and store it. A first failure to store warns; all fits are in memory anyway."""

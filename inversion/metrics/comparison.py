@@ -16,8 +16,8 @@ import scipy
 from jaxtyping import Float, Shaped
 
 from jaxlidar.extend import as_numpy, check_number
+from jaxlidar.formats.tables import matching_rows
 from jaxlidar.io import ShotTable
-from jaxlidar.io.tables import matching_rows
 
 # Fewest rows of which a rank correlation is given, and the class of all rows.
 _MIN_RANKED, _ALL_ROWS = 3, "all"

@@ -59,11 +59,11 @@ from jaxlidar.extend import (
     check_range,
     even_step,
 )
+from jaxlidar.formats.gedi import IncompleteShot, read_gedi_rows
+from jaxlidar.formats.tables import ColumnAxis
 from jaxlidar.io import Column, GediShot, ShotTable
-from jaxlidar.io.gedi import IncompleteShot, read_gedi_rows
-from jaxlidar.io.store import check_store_path
-from jaxlidar.io.tables import ColumnAxis
 from jaxlidar.progress import ProgressOption, shows_progress
+from jaxlidar.results.store import check_store_path
 from jaxlidar.survey.records import record_bucket
 
 # Setting groups of the product, and shots that are computed at once.

@@ -43,7 +43,7 @@ from jaxtyping import ArrayLike, Float, Int, Shaped
 from inversion.fit.quality import Verdict
 from jaxlidar import SPEED_OF_LIGHT
 from jaxlidar.extend import as_numpy, check_integer, check_kind, check_range
-from jaxlidar.io.icesat2 import PhotonTrack
+from jaxlidar.formats.icesat2 import PhotonTrack
 from jaxlidar.sensors.photon_counter import PhotonEvents
 
 # Half-axes of the ellipse in m: along the track, in height.

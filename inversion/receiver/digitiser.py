@@ -21,7 +21,7 @@ from jaxtyping import ArrayLike, Float, Shaped
 
 from inversion.receiver.impulse import HardTargetEcho, receiver_impulse
 from jaxlidar.extend import as_numpy, check_number, check_range
-from jaxlidar.io.noise import above_pedestal
+from jaxlidar.formats.noise import above_pedestal
 
 # Tables in decibels mark counts without an amplitude by entries below this (RIEGL's PulseWaves: -2e37).
 _NO_AMPLITUDE = -1e3

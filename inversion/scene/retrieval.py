@@ -71,8 +71,9 @@ from jaxlidar.extend import (
     check_range,
     fingerprint,
 )
-from jaxlidar.io.store import ResultStore, dataset_of_rows, open_store
 from jaxlidar.progress import ProgressOption, shows_progress
+from jaxlidar.results.netcdf import store_result
+from jaxlidar.results.store import ResultStore, dataset_of_rows, open_store
 
 # Rays of a footprint unless they are given: one for each column of voxels in it, within limits; photons.
 _RAYS, _PHOTONS = (32, 512), 2048
@@ -263,25 +264,28 @@ def retrieve_scene(
         end = _fit(problem, max_steps, random, steps, progress)
         errors = _draws_of_error(problem, end, draws, host_key, stored_draws, progress)
         rows = _averaging_kernels(problem, end, places, stored_kernels, progress)
-    return make_scene_retrieval(
-        unknowns=model.all_unknowns,
-        values=end.x,
-        draws=errors,
-        at_bound=~problem.is_free(end.x),
-        kernels=rows,
-        kernel_places=places,
-        scene=model.scene_at(end.x),
-        time=records.time,
-        wavelength=np.asarray(survey.lidar.wavelength),
-        fitted=end.pulled.records,
-        residuals=(records.observed - end.pulled.records) * weight,
-        held_out=is_held_out,
-        misfit=end.misfit,
-        held_out_misfit=end.held_out_misfit,
-        history=end.history,
-        converged=end.converged,
-        status=end.status,
-    )
+        result = make_scene_retrieval(
+            unknowns=model.all_unknowns,
+            values=end.x,
+            draws=errors,
+            at_bound=~problem.is_free(end.x),
+            kernels=rows,
+            kernel_places=places,
+            scene=model.scene_at(end.x),
+            time=records.time,
+            wavelength=np.asarray(survey.lidar.wavelength),
+            fitted=end.pulled.records,
+            residuals=(records.observed - end.pulled.records) * weight,
+            held_out=is_held_out,
+            misfit=end.misfit,
+            held_out_misfit=end.held_out_misfit,
+            history=end.history,
+            converged=end.converged,
+            status=end.status,
+        )
+        if store is not None:
+            store_result(store, result)
+    return result
 
 
 # -- arguments ---------------------------------------------------------------------------------------------

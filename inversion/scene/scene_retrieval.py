@@ -13,7 +13,7 @@ from inversion.fit.fit_summary import short_text
 from inversion.fit.unknowns import BoundUnknown, bounds_by_name, split_by_name
 from jaxlidar import Scene
 from jaxlidar.io import save
-from jaxlidar.io.datasets import datasets_of, variables_by_item
+from jaxlidar.results.datasets import datasets_of, variables_by_item
 
 # Values of an unknown beyond which a summary shows quantiles.
 _FEW_VALUES = 8

@@ -9,10 +9,11 @@ wrong type. NumPy and JAX would drop a mask and take booleans and times for numb
 arguments become arrays by `as_array` or `as_numpy`.
 """
 
+import contextlib
 import operator
 import sys
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from numbers import Real
 from types import FrameType, UnionType
 from typing import Any, NamedTuple, TypeAlias
@@ -24,7 +25,6 @@ from jax import lax
 from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Float
 
-from jaxlidar._registry import common_crs
 from jaxlidar._text import number_text
 
 # Numbers as users give them: one, an array, or rows of them in lists and tuples.
@@ -42,14 +42,6 @@ def as_scalar(x: ArrayLike, field: str = "value") -> Float[Array, ""]:
     if a.size != 1:
         raise ValueError(f"{field} has shape {a.shape}; admissible is one number")
     return a.reshape(()) if a.ndim else a
-
-
-def crs_name(x: Any) -> str | None:
-    """Convert a field `crs`: the name of a map in metres, such as "EPSG:32633", its EPSG number, or None.
-
-    **Raises:** ValueError for a system that is not known or not in metres; TypeError for other objects.
-    """
-    return common_crs({"crs": x})
 
 
 def as_optional_scalar(x: ArrayLike | None, field: str = "value") -> Float[Array, ""] | None:
@@ -483,3 +475,19 @@ def warn_user(message: str, category: type[Warning] = UserWarning) -> None:
 
 def _top_package(frame: FrameType) -> str:
     return frame.f_globals.get("__name__", "").split(".")[0]
+
+
+# -- packages ---------------------------------------------------------------------------------------------
+
+
+@contextlib.contextmanager
+def required_for(purpose: str, extra: str = "io") -> Iterator[None]:
+    """Within the context, import packages of an extra.
+
+    **Raises:** ImportError that names the purpose, the package that is missing, and how to install it. The
+    error of a package that is installed, but cannot be loaded, passes as it is.
+    """
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        raise ImportError(f'{purpose} needs {error.name}: pip install "jaxlidar[{extra}]"') from error

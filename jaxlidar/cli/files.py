@@ -10,6 +10,11 @@ import click
 import numpy as np
 
 from jaxlidar.cli.shared import ResultPath
+from jaxlidar.formats.airborne import AirborneShots
+from jaxlidar.formats.dem import read_grid
+from jaxlidar.formats.las import read_stored_points
+from jaxlidar.formats.las_header import read_header
+from jaxlidar.formats.las_waveforms import has_packets
 from jaxlidar.io import (
     AirborneShot,
     Case,
@@ -27,15 +32,10 @@ from jaxlidar.io import (
     write_case,
     write_las_waveforms,
 )
-from jaxlidar.io.airborne import AirborneShots
-from jaxlidar.io.dem import read_grid
-from jaxlidar.io.las import read_stored_points
-from jaxlidar.io.las_header import read_header
-from jaxlidar.io.las_waveforms import has_packets
-from jaxlidar.io.netcdf import open as open_result
 from jaxlidar.optics.prospect import Prospect
 from jaxlidar.optics.spectra import read_spectrum_csv
 from jaxlidar.plants.inventory import columns_in_use
+from jaxlidar.results.netcdf import open as open_result
 from jaxlidar.scenes.canopy import Canopy
 from jaxlidar.scenes.scene import Scene
 from jaxlidar.scenes.voxels import VoxelMap

@@ -76,7 +76,7 @@ def _is_module(name: str) -> bool:
 
 def _with_classes_of_results(module: types.ModuleType) -> types.ModuleType:
     """Return a module whose public names include the classes of results, which users receive by functions."""
-    if not hasattr(module, "__all__") or not hasattr(module, "__path__"):
+    if not hasattr(module, "__all__"):
         return module
     classes = classes_of_results(module)
     page = types.ModuleType(module.__name__, module.__doc__)
@@ -84,26 +84,30 @@ def _with_classes_of_results(module: types.ModuleType) -> types.ModuleType:
     return page
 
 
-def classes_of_results(package: types.ModuleType) -> dict[str, type]:
+def classes_of_results(module: types.ModuleType) -> dict[str, type]:
     """Find the classes that users receive from functions, by name: they have an example, as all that users
-    see, and are no public names. Those of packages with public names of their own are left out.
+    see, and are no public names. Those of modules with public names of their own are left out.
     """
-    public, classes = [getattr(package, name) for name in package.__all__], {}
-    packages = [value.__name__ + "." for value in public if hasattr(value, "__path__")]
-    public += [
-        getattr(value, name)
-        for value in public
-        if inspect.ismodule(value)
-        for name in vars(value).get("__all__", ())
-    ]
-    for info in pkgutil.walk_packages(package.__path__, package.__name__ + "."):
-        if info.name.startswith(tuple(packages)) or info.name.endswith("__main__"):
+    public, classes = [getattr(module, name) for name in module.__all__], {}
+    others = [value for value in public if hasattr(value, "__all__")]
+    public += [getattr(other, name) for other in others for name in other.__all__]
+    names_of_others = {name for other in others for name in _names_of_modules(other)}
+    for module_name in _names_of_modules(module):
+        if module_name in names_of_others:
             continue
-        for name, value in vars(pkgutil.resolve_name(info.name)).items():
-            is_defined_there = inspect.isclass(value) and value.__module__ == info.name
+        for name, value in vars(pkgutil.resolve_name(module_name)).items():
+            is_defined_there = inspect.isclass(value) and value.__module__ == module_name
             if is_defined_there and value not in public and ">>>" in (value.__doc__ or ""):
                 classes[name] = value
     return classes
+
+
+def _names_of_modules(module: types.ModuleType) -> list[str]:
+    """Return the names of the modules of a package, or of those whose names a module hands on."""
+    if not hasattr(module, "__path__"):
+        return sorted({getattr(module, name).__module__ for name in module.__all__})
+    names = [info.name for info in pkgutil.walk_packages(module.__path__, module.__name__ + ".")]
+    return [name for name in names if not name.endswith("__main__")]
 
 
 def find_pages(packages: list[str]) -> dict[Path, str]:

@@ -8,7 +8,7 @@ from typing import Any
 import click
 
 from jaxlidar.io import atomic_write
-from jaxlidar.io.store import is_zarr
+from jaxlidar.results.store import is_zarr
 
 CASE_ARGUMENT = click.argument("case", type=click.Path(dir_okay=False, path_type=Path), metavar="CASE.toml")
 PLOT_OPTION = click.option(

@@ -17,9 +17,9 @@ from jaxlidar.cli.shared import (
     shows_bar,
 )
 from jaxlidar.io import Case, read_case
-from jaxlidar.io.netcdf import open as open_result
-from jaxlidar.io.store import is_zarr, remove_store, store_beside
 from jaxlidar.planning.plan import plan as make_plan
+from jaxlidar.results.netcdf import open as open_result
+from jaxlidar.results.store import is_zarr, remove_store, store_beside
 from jaxlidar.sensors.lidar import Lidar
 
 # Arguments of `simulate` that `jaxlidar.plan` has, too.

@@ -29,14 +29,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from jaxlidar._fields.checks import (
-    as_array,
-    as_scalar,
-    check_choice,
-    check_kind,
-    check_range,
-    concrete,
-)
+from jaxlidar._fields.checks import as_array, as_scalar, check_choice, check_kind, check_range, concrete
 from jaxlidar._fields.ranges import (
     FRACTION,
     NANOMETRES,

@@ -7,8 +7,8 @@ from typing import Any, final, overload
 import numpy as np
 from jaxtyping import Float, Int
 
-from jaxlidar._fields.checks import Numbers, check_kind, check_number, check_range, check_shape, crs_name
-from jaxlidar._registry import common_crs
+from jaxlidar._fields.checks import Numbers, check_kind, check_number, check_range, check_shape
+from jaxlidar._fields.crs import common_system, crs_name
 from jaxlidar.plants.tree import Tree
 from jaxlidar.scenes.terrain import Terrain
 
@@ -140,7 +140,7 @@ class Stand(Sequence[Tree]):
             np.concatenate([stand.azimuth for stand in alike]),
             np.concatenate([stand.scale for stand in alike]),
             np.concatenate(areas) if areas else None,
-            common_crs({f"stands[{i}]": stand.crs for i, stand in enumerate(alike)}),
+            common_system({f"stands[{i}]": stand.crs for i, stand in enumerate(alike)}),
         )
 
     def __len__(self) -> int:
@@ -266,7 +266,7 @@ class Stand(Sequence[Tree]):
         an object that is none.
         """
         check_kind("terrain", terrain, Terrain, "a Terrain")
-        crs = common_crs({"stand": self.crs, "terrain": terrain.crs})
+        crs = common_system({"stand": self.crs, "terrain": terrain.crs})
         lift = np.asarray(terrain.height_at(self.position[:, 0], self.position[:, 1]), float)
         return self._with(position=self.position + lift[:, None] * [0.0, 0.0, 1.0], crs=crs)
 

@@ -7,7 +7,7 @@ from jaxtyping import ArrayLike
 from matplotlib.axes import Axes
 
 from jaxlidar._fields.checks import check_kind, check_range, check_shape, concrete_array
-from jaxlidar.io.icesat2 import PhotonTrack
+from jaxlidar.formats.icesat2 import PhotonTrack
 from jaxlidar.plot.style import MATERIAL_COLOURS, OTHER_COLOUR, TOTAL_COLOUR, make_axes
 from jaxlidar.sensors.photon_counter import PhotonEvents
 

@@ -28,11 +28,11 @@ from jaxlidar._fields.checks import (
     check_shape,
     concrete,
     concrete_array,
-    crs_name,
     fixed_array,
     has_tracers,
     kind_of,
 )
+from jaxlidar._fields.crs import crs_name
 from jaxlidar._fields.ranges import DEGREES, FINITE, POSITIVE, SUM_OF_FRACTIONS, check_ranges, quantity
 from jaxlidar._jax.products import einsum, matmul
 from jaxlidar._vectors import FAR, Scalar, Vec, along, dot, vec

@@ -12,8 +12,8 @@ import scipy
 from jaxtyping import Array, Float
 
 from jaxlidar._fields.checks import check_kind, concrete, concrete_array, has_tracers, kind_of
+from jaxlidar._fields.crs import common_system
 from jaxlidar._fields.ranges import Range
-from jaxlidar._registry import common_crs
 from jaxlidar._text import object_text
 from jaxlidar._vectors import FAR
 from jaxlidar.scenes.atmosphere import Atmosphere
@@ -182,7 +182,9 @@ class Scene(eqx.Module):
         """Coordinate reference system of terrain, voxel map and meshes; None if unknown."""
         ground = {"ground": self.ground.crs} if isinstance(self.ground, Terrain) else {}
         voxels = {} if self.canopy is None else {"canopy": self.canopy.voxels.crs}
-        return common_crs(ground | voxels | {f"meshes[{i}]": mesh.crs for i, mesh in enumerate(self.meshes)})
+        return common_system(
+            ground | voxels | {f"meshes[{i}]": mesh.crs for i, mesh in enumerate(self.meshes)}
+        )
 
     @property
     def gap(self) -> Float[Array, ""] | None:

@@ -30,8 +30,8 @@ from jaxlidar._fields.checks import (
     concrete,
     concrete_array,
     coordinates,
-    crs_name,
 )
+from jaxlidar._fields.crs import crs_name
 from jaxlidar._fields.ranges import FRACTION, POSITIVE, check_ranges, quantity
 from jaxlidar._vectors import normalise
 from jaxlidar.optics.laws import AbstractLaw, AbstractMirror, Lambertian

@@ -30,12 +30,11 @@ from jaxlidar._fields.checks import (
     concrete,
     concrete_array,
     coordinates,
-    crs_name,
     has_tracers,
 )
+from jaxlidar._fields.crs import common_system, crs_name
 from jaxlidar._fields.ranges import NOT_NEGATIVE, POSITIVE, check_ranges, quantity
 from jaxlidar._jax.memory import machine_memory
-from jaxlidar._registry import common_crs
 from jaxlidar._text import object_text
 from jaxlidar.optics.leaf_angles import LeafAngles
 from jaxlidar.scenes.terrain import Terrain
@@ -281,7 +280,7 @@ class VoxelMap(eqx.Module):
         (2, 2, 5) [0.0, 0.0, 10.0] [[0.25, 0.5, 0.5, 0.25, 0.0], [0.0, 0.25, 0.5, 0.5, 0.25]]
         """
         check_kind("terrain", terrain, Terrain, "a Terrain")
-        crs = common_crs({"voxels": self.crs, "terrain": terrain.crs})
+        crs = common_system({"voxels": self.crs, "terrain": terrain.crs})
         size, origin, heights = (concrete(a) for a in (self.voxel_size, self.origin, terrain.heights))
         if size is None or origin is None or heights is None:
             raise ValueError("a JAX transformation is tracing the map or the terrain: lift the map outside")
@@ -358,7 +357,7 @@ class VoxelMap(eqx.Module):
                 raise ValueError(
                     f"maps[{number}].leaf_angles differ from those of maps[0]; admissible are equal"
                 )
-        crs = common_crs({f"maps[{number}]": voxels.crs for number, voxels in enumerate(maps)})
+        crs = common_system({f"maps[{number}]": voxels.crs for number, voxels in enumerate(maps)})
         check_range("azimuth", azimuth)
         check_shape("azimuth", azimuth, (), (len(maps),))
         turns = np.broadcast_to(as_numpy(azimuth, "azimuth"), (len(maps),))

@@ -35,11 +35,11 @@ from jaxlidar._fields.checks import (
     check_shape,
     concrete_array,
     concrete_number,
-    crs_name,
     warn_unit,
 )
+from jaxlidar._fields.crs import common_system, crs_name
 from jaxlidar._jax.memory import format_bytes, machine_memory
-from jaxlidar._registry import common_crs, shots_within
+from jaxlidar._registry import shots_within
 from jaxlidar._text import number_text
 from jaxlidar.sensors.lidar import AIM_DISTANCE, STRAIGHT_UP, Lidar
 from jaxlidar.sensors.scan import MAX_ZENITH, AbstractScan
@@ -298,7 +298,7 @@ class Survey(eqx.Module):
         fields = {name: rows(name) for name in ("zenith", "azimuth", "altitude", *_OPTIONAL_ROWS)}
         if any(survey.stated is not None for survey in surveys):
             fields["stated"] = np.concatenate([survey.stated_rows for survey in surveys])
-        crs = common_crs({f"surveys[{i}]": survey.crs for i, survey in enumerate(surveys)})
+        crs = common_system({f"surveys[{i}]": survey.crs for i, survey in enumerate(surveys)})
         place = {"sensor" if first.has_sensor_position else "position": rows("position")}
         flight_line = rows("flight_line")
         if flight_line is None:
@@ -701,7 +701,7 @@ def _lifted(flight: Trajectory, terrain: Any) -> Trajectory:
     """Return a trajectory whose heights are above a terrain as one whose heights are above z = 0."""
     if not callable(getattr(terrain, "height_at", None)):
         raise TypeError(f"above is a {type(terrain).__name__}; admissible is a Terrain, or None")
-    crs = common_crs({"trajectory": flight.crs, "above": getattr(terrain, "crs", None)})
+    crs = common_system({"trajectory": flight.crs, "above": getattr(terrain, "crs", None)})
     ground = np.asarray(terrain.height_at(flight.position[:, 0], flight.position[:, 1]), float)
     lifted = flight.position + np.pad(ground[:, None], ((0, 0), (2, 0)))
     return dataclasses.replace(flight, position=lifted, crs=crs)

@@ -25,7 +25,8 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
-from jaxlidar._fields.checks import Numbers, UnitWarning, as_numpy, check_range, crs_name, warn_user
+from jaxlidar._fields.checks import Numbers, UnitWarning, as_numpy, check_range, warn_user
+from jaxlidar._fields.crs import crs_name
 from jaxlidar._text import number_text
 
 # Courses of two positions that are nearer to one another than this, m, are not defined.

@@ -8,7 +8,7 @@ from jaxtyping import Float, Int
 
 from jaxlidar._constants import PLANCK_TIMES_LIGHT
 from jaxlidar._fields.checks import concrete_array, concrete_number
-from jaxlidar.io.datasets import keep_as_netcdf
+from jaxlidar.results.datasets import keep_as_netcdf
 from jaxlidar.sensors.lidar import Lidar
 from jaxlidar.sensors.receiver import Receiver
 from jaxlidar.sensors.survey import Survey

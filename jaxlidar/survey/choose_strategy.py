@@ -7,8 +7,9 @@ import numpy as np
 
 from jaxlidar._constants import SPEED_OF_LIGHT
 from jaxlidar._fields.checks import concrete_array, concrete_number
+from jaxlidar._fields.crs import common_system
 from jaxlidar._jax.memory import format_bytes
-from jaxlidar._registry import common_crs, survey_lines
+from jaxlidar._registry import survey_lines
 from jaxlidar._text import percent
 from jaxlidar.optics.laws import AbstractMirror
 from jaxlidar.planning.local_origin import move_aim_to_origin
@@ -66,7 +67,7 @@ def choose_strategy(
     `window`: times of the first and the last sample, ns; None: those that the scene needs. `kept_names`: of
     the `OPTIONAL_ARRAYS` that results have.
     """
-    common_crs({"survey": survey.crs, "scene": scene.crs})
+    common_system({"survey": survey.crs, "scene": scene.crs})
     plan = make_plan(survey, scene, rtol=rtol, max_orders=max_orders, window=window, describe=False)
     rtol = DEFAULT_RTOL if rtol is None else float(rtol)
     # Eight batches then have 6.4 / rtol^2 photons, before these are rounded and bounded: a sample with a

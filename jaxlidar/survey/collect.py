@@ -17,11 +17,11 @@ from jaxtyping import Int
 from jaxlidar._fields.checks import warn_user
 from jaxlidar._not_kept import NotKept
 from jaxlidar._text import outside_message, unfollowed_message
-from jaxlidar.io.case import Case
-from jaxlidar.io.datasets import datasets_of
-from jaxlidar.io.groups import write_zarr_group
-from jaxlidar.io.netcdf import datasets_with_case
-from jaxlidar.io.store import ResultStore, consolidate, dataset_of_rows
+from jaxlidar.results.case import Case
+from jaxlidar.results.datasets import datasets_of
+from jaxlidar.results.groups import write_zarr_group
+from jaxlidar.results.netcdf import datasets_with_case
+from jaxlidar.results.store import ResultStore, consolidate, dataset_of_rows
 from jaxlidar.simulation.one_scene import LateLightWarning, UnfollowedLightWarning
 from jaxlidar.spectral.apply_optics import make_waveform_model, refuse_excess
 from jaxlidar.spectral.truth_class import Truth

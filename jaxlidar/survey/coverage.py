@@ -6,8 +6,9 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from jaxlidar._fields.checks import as_array, check_kind, concrete_array
+from jaxlidar._fields.crs import common_system
 from jaxlidar._jax.programs import Program
-from jaxlidar._registry import common_crs, shots_within
+from jaxlidar._registry import shots_within
 from jaxlidar._text import NOTABLE_FRACTION, percent
 from jaxlidar._vectors import FAR, vec
 from jaxlidar.planning.path_lengths import footprints_on_terrain
@@ -141,7 +142,7 @@ def ground_position(survey: Survey, scene: Scene) -> Float[np.ndarray, "shots 3"
     """
     check_kind("survey", survey, Survey, "a Survey")
     check_kind("scene", scene, Scene, "a Scene")
-    common_crs({"survey": survey.crs, "scene": scene.crs})
+    common_system({"survey": survey.crs, "scene": scene.crs})
     ground, axis = scene.ground, survey.direction
     if ground is None:
         return np.full((len(survey), 3), np.nan)
@@ -177,7 +178,7 @@ def shots_on_ground(survey: Survey, scene: Scene, margin: float = 0.0) -> Bool[n
 def _shots_within(survey: Survey, scene: Scene, margin: float) -> Bool[np.ndarray, " shots"]:
     """Return the shots that `Survey.within` keeps. **Raises:** as that."""
     check_kind("scene", scene, Scene, "a Scene")
-    common_crs({"survey": survey.crs, "scene": scene.crs})
+    common_system({"survey": survey.crs, "scene": scene.crs})
     ground, box = scene.ground, _box(scene)
     is_within, extent = shots_on_ground(survey, scene, margin), box
     if isinstance(ground, Terrain) and ground.relief and ground.sides == "open":

@@ -60,10 +60,10 @@ from jaxlidar._fields.checks import (
     check_range,
     warn_user,
 )
+from jaxlidar._fields.crs import common_system
 from jaxlidar._not_kept import NotKept
-from jaxlidar._registry import common_crs
-from jaxlidar.io.airborne import AirborneShot, Returns, Segment
-from jaxlidar.io.las import LasWriter, write_las
+from jaxlidar.formats.airborne import AirborneShot, Returns, Segment
+from jaxlidar.formats.las import LasWriter, write_las
 from jaxlidar.planning.channels import unnumbered
 from jaxlidar.progress import Progress, ProgressOption
 from jaxlidar.sensors.lidar import Lidar
@@ -242,7 +242,7 @@ class DiscreteReturns(eqx.Module):
                 "the threshold; give a lower threshold to returns or to_las (min_reflectance to "
                 "true_returns), or write the waveforms with to_las_waveforms"
             )
-        crs = common_crs({"the simulation": self.crs, "crs": crs})
+        crs = common_system({"the simulation": self.crs, "crs": crs})
         write_las(path, self.position, crs=crs, **self._point_fields(self.intensity))
 
     def _point_fields(self, intensity: Num[np.ndarray, " returns"]) -> dict[str, Any]:

@@ -30,12 +30,13 @@ from jaxlidar._fields.checks import (
     is_within_program,
     warn_user,
 )
+from jaxlidar._fields.crs import common_system
 from jaxlidar._fingerprint import fingerprint
 from jaxlidar._jax.workers import WorkUnit, outcomes
-from jaxlidar._registry import common_crs, simulate_survey
-from jaxlidar.io.case import Case, case_text
-from jaxlidar.io.store import check_store_path, open_store
+from jaxlidar._registry import simulate_survey
 from jaxlidar.progress import Progress, ProgressOption, shows_progress
+from jaxlidar.results.case import Case, case_text
+from jaxlidar.results.store import check_store_path, open_store
 from jaxlidar.scenes.scene import Scene, check_kinds
 from jaxlidar.scenes.scene_parts import SceneParts
 from jaxlidar.sensors.survey import Survey
@@ -205,7 +206,7 @@ def simulate_many(
     }
     run_tasks = functools.partial(outcomes, executor=executor, devices=devices)
     is_narrow = isinstance(scene, Scene) and beams_are_narrow(survey, scene.canopy)
-    crs = common_crs({"survey": survey.crs, "scene": scene.crs if isinstance(scene, Scene) else None})
+    crs = common_system({"survey": survey.crs, "scene": scene.crs if isinstance(scene, Scene) else None})
     info: dict[str, Any] = {"automatic orders": max_orders is None, "narrow beams": is_narrow, "crs": crs}
     info |= {} if survey.stated is None else {"disturbed": True}
     if path is None:

@@ -11,16 +11,17 @@ from jaxtyping import ArrayLike, Float, Int
 
 from jaxlidar._constants import SPEED_OF_LIGHT
 from jaxlidar._fields.checks import check_index, check_numbers
+from jaxlidar._fields.crs import common_system
 from jaxlidar._not_kept import NotKept
-from jaxlidar._registry import common_crs, detect_returns, true_returns
+from jaxlidar._registry import detect_returns, true_returns
 from jaxlidar._text import NOTABLE_FRACTION, percent
-from jaxlidar.io import netcdf
-from jaxlidar.io.case import Case
-from jaxlidar.io.datasets import datasets_of, keep_as_netcdf
-from jaxlidar.io.las import LasWriter
-from jaxlidar.io.las_waveforms import write_las_waveforms
-from jaxlidar.io.netcdf import WAVEFORM_QUANTITIES
+from jaxlidar.formats.las import LasWriter
+from jaxlidar.formats.las_waveforms import write_las_waveforms
 from jaxlidar.progress import ProgressOption, shows_progress
+from jaxlidar.results import netcdf
+from jaxlidar.results.case import Case
+from jaxlidar.results.datasets import datasets_of, keep_as_netcdf
+from jaxlidar.results.netcdf import WAVEFORM_QUANTITIES
 from jaxlidar.sampling.adaptive import StopReason
 from jaxlidar.sensors.lidar import Lidar
 from jaxlidar.sensors.survey import beam_directions
@@ -410,7 +411,7 @@ class Waveforms(eqx.Module):
         2 shots, 2.5 m
         """
         wavelength, record = options.get("wavelength"), options.get("record")
-        crs = common_crs({"the simulation": self.crs, "crs": crs})
+        crs = common_system({"the simulation": self.crs, "crs": crs})
         returns = self.returns(detector, **{"max_returns": MAX_LAS_RETURNS, **options})
         waves = input_of_waveforms(self, wavelength)
         records = waves.recorded if record is None else _at_wavelength(record, self.wavelength, wavelength)

@@ -110,7 +110,7 @@ def test_an_interrupted_simulation_is_saved(tmp_path, capsys, monkeypatch):
         wave.info["stopped"] = "interrupted"
         return wave
 
-    monkeypatch.setattr("jaxlidar.io.case.simulate", interrupted)
+    monkeypatch.setattr("jaxlidar.results.case.simulate", interrupted)
     out = tmp_path / "a.nc"
     assert cli.main(["simulate", str(SCENES / "flat_ground.toml"), "-o", str(out)]) == 130
     assert jl.open(out).info["stopped"] == "interrupted"
@@ -118,7 +118,7 @@ def test_an_interrupted_simulation_is_saved(tmp_path, capsys, monkeypatch):
     def early(*args, **kwargs):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("jaxlidar.io.case.simulate", early)
+    monkeypatch.setattr("jaxlidar.results.case.simulate", early)
     capsys.readouterr()
     assert cli.main(["simulate", str(SCENES / "flat_ground.toml"), "-o", str(tmp_path / "b.nc")]) == 130
     assert capsys.readouterr().err.strip() == "jaxlidar: interrupted"
@@ -131,7 +131,7 @@ def test_an_interrupted_survey_says_where_finished_shots_are(tmp_path, capsys, m
 
     case, out = tmp_path / "a.toml", tmp_path / "a.nc"
     case.write_text(SURVEY)
-    monkeypatch.setattr("jaxlidar.io.case.simulate_survey", interrupted)
+    monkeypatch.setattr("jaxlidar.results.case.simulate_survey", interrupted)
     assert cli.main(["simulate", str(case), "-o", str(out)]) == 130
     assert f"kept in {out}.zarr: the same command continues" in capsys.readouterr().err
     assert cli.main(["simulate", str(case)]) == 130

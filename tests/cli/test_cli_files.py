@@ -8,8 +8,8 @@ import pytest
 
 import jaxlidar as jl
 from jaxlidar import cli
-from tests.io import test_gedi as test_io
-from tests.io import test_las_waveforms, test_neon, test_pulsewaves
+from tests.formats import test_gedi as test_io
+from tests.formats import test_las_waveforms, test_neon, test_pulsewaves
 
 
 @pytest.fixture(autouse=True)

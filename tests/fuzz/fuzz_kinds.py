@@ -26,13 +26,13 @@ MAX_SECONDS, MAX_BYTES = 10.0, 2**28
 
 
 def small_vox() -> bytes:
-    from tests.io.test_readers import vox
+    from tests.formats.test_readers import vox
 
     return vox().encode()
 
 
 def small_qsm() -> bytes:
-    from tests.io.test_readers import QSM
+    from tests.formats.test_readers import QSM
 
     return QSM.encode()
 
@@ -113,28 +113,28 @@ def small_cloud(compress: bool, point_format: int = 6, points: int = 60) -> byte
 
 
 def small_gedi() -> bytes:
-    from tests.io.test_gedi import write_small
+    from tests.formats.test_gedi import write_small
 
     with tempfile.TemporaryDirectory() as folder:
         return write_small(Path(folder) / "small.h5").read_bytes()
 
 
 def small_level_2(kind: str) -> bytes:
-    from tests.io.test_gedi_level2 import write_level_2
+    from tests.formats.test_gedi_level2 import write_level_2
 
     with tempfile.TemporaryDirectory() as folder:
         return write_level_2(Path(folder) / "small.h5", kind).read_bytes()
 
 
 def small_icesat2(writer: str, **options: bool) -> bytes:
-    from tests.io import test_icesat2
+    from tests.formats import test_icesat2
 
     with tempfile.TemporaryDirectory() as folder:
         return getattr(test_icesat2, writer)(Path(folder) / "small.h5", **options).read_bytes()
 
 
 def small_lvis() -> bytes:
-    from tests.io.test_lvis import write_level_1
+    from tests.formats.test_lvis import write_level_1
 
     with tempfile.TemporaryDirectory() as folder:
         return write_level_1(Path(folder) / "small.h5", 2).read_bytes()
@@ -147,7 +147,7 @@ def small_lvis_text() -> bytes:
 
 
 def small_neon() -> bytes:
-    from tests.io.test_neon import write_small
+    from tests.formats.test_neon import write_small
 
     with tempfile.TemporaryDirectory() as folder:
         return write_small(Path(folder) / "small.npz").read_bytes()
@@ -156,7 +156,7 @@ def small_neon() -> bytes:
 @functools.cache
 def small_pulsewaves(index: int) -> bytes:
     """Return one of the two files of a PulseWaves record: the pulses (0) or their waves (1)."""
-    from tests.io.test_pulsewaves import small_files
+    from tests.formats.test_pulsewaves import small_files
 
     return small_files()[index]
 
@@ -164,7 +164,7 @@ def small_pulsewaves(index: int) -> bytes:
 @functools.cache
 def small_las_waveforms(index: int) -> bytes:
     """Return one of the two files of LAS with waveforms: the points (0) or their packets (1)."""
-    from tests.io.test_las_waveforms import small_files
+    from tests.formats.test_las_waveforms import small_files
 
     with tempfile.TemporaryDirectory() as folder:
         return small_files(Path(folder))[index]

@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 
 import jaxlidar as jl
 from jaxlidar import plot
-from jaxlidar.io.icesat2 import PhotonTrack
+from jaxlidar.formats.icesat2 import PhotonTrack
 from jaxlidar.plot.style import check_waveform
 
 matplotlib.use("agg")

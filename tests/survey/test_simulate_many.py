@@ -17,13 +17,13 @@ import pytest
 import zarr
 
 import jaxlidar as jl
-from jaxlidar.io.store import StoredRows
+from jaxlidar.results.store import StoredRows
 from jaxlidar.sampling.adaptive import StopReason
 from jaxlidar.survey import choose_strategy, coverage
 from jaxlidar.survey.coverage import ground_heights, off_map
 from jaxlidar.survey.footprint_splines import fit_footprints
-from tests.io.test_store import flip_a_bit
 from tests.quick_compilation import optimise_programs
+from tests.results.test_store import flip_a_bit
 
 KEY = jax.random.key(5)
 

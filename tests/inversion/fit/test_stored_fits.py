@@ -15,10 +15,10 @@ import inversion
 import jaxlidar as jl
 from inversion.fit.fit_summary import FitSummary
 from inversion.fit.retrieval_many import FinishedFits
-from jaxlidar.io.store import StoredRows, open_store
+from jaxlidar.results.store import StoredRows, open_store
 from tests.helpers import ask
 from tests.inversion.fit.test_fingerprint import PROBLEM, TIME, unknowns
-from tests.io.test_store import UNWRITABLE, flip_a_bit, unwritable
+from tests.results.test_store import UNWRITABLE, flip_a_bit, unwritable
 
 ROOT = Path(__file__).resolve().parents[3]
 
@@ -167,6 +167,9 @@ def test_fits_of_a_damaged_chunk_are_repeated(tmp_path, monkeypatch):
     np.testing.assert_array_equal(fits.values["height"], expected.values["height"])
     # It has been replaced: no warning.
     run(path, lambda p: pytest.fail("a fit was repeated"))
+    opened = jl.open(path)
+    assert jax.tree.structure(opened) == jax.tree.structure(fits)
+    jax.tree.map(np.testing.assert_array_equal, opened, fits)
 
 
 def test_a_full_disk_warns_once_and_results_are_returned(tmp_path, monkeypatch):

@@ -7,8 +7,8 @@ from matplotlib.figure import Figure
 
 import inversion
 import jaxlidar as jl
+from jaxlidar.formats.tables import ColumnAxis
 from jaxlidar.io import Column, ShotTable
-from jaxlidar.io.tables import ColumnAxis
 
 matplotlib.use("agg")
 

@@ -10,7 +10,7 @@ import inversion
 import jaxlidar as jl
 from inversion.metrics import photons
 from jaxlidar._constants import PLANCK_TIMES_LIGHT
-from jaxlidar.io.icesat2 import PhotonTrack
+from jaxlidar.formats.icesat2 import PhotonTrack
 from jaxlidar.sensors.photon_counter import PhotonEvents
 
 # An even canopy, m above ground.

@@ -459,12 +459,15 @@ def test_an_interrupted_run_goes_on_and_another_problem_is_refused(tmp_path):
 
     with pytest.raises(KeyboardInterrupt):
         run(progress=interrupt)
+    with pytest.raises(ValueError, match="rows are missing: the run that writes them has not ended"):
+        jl.open(path)
     steps = []
     resumed = run(progress=steps.append)
     # The fit and two draws were done.
     assert [(s.stage, s.number) for s in steps] == [("errors", 3)]
     uninterrupted = inversion.retrieve_scene(records, survey, START, [HEIGHT], key=KEY, **shared)
     np.testing.assert_allclose(resumed.draws["height"], uninterrupted.draws["height"], rtol=1e-6)
+    np.testing.assert_array_equal(jl.open(path).draws["height"], resumed.draws["height"])
     with pytest.raises(ValueError, match="another problem, which differs in key"):
         run(key=jax.random.key(7))
 

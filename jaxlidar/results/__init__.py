@@ -1,0 +1,1 @@
+"""Results as data sets: cases that repeat a simulation, netCDF files, and the store of long runs."""
