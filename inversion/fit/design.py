@@ -59,6 +59,7 @@ from inversion.fit.unknowns import (
 )
 from jaxlidar import Lidar, Plan, Scene
 from jaxlidar.extend import (
+    Program,
     as_numpy,
     check_integer,
     check_key,
@@ -69,6 +70,7 @@ from jaxlidar.extend import (
 )
 from jaxlidar.planning.effects import effects_of_family
 from jaxlidar.planning.scene_family import check_scenes, plan_cases
+from jaxlidar.planning.size_buckets import size_bucket
 from jaxlidar.trace.response import Response
 
 # Fields of a lidar that can be free: those that act after the trace, of which `inversion.fit.unknowns` names
@@ -227,62 +229,45 @@ class _DesignProblem(eqx.Module):
     - `free_values`: their places in the lidar and their bounds.
     - `noises`: of each scene, an array or a function, as of `design`.
     - `names`, `shapes`, `labels`: of the unknowns. - `cost_of_bound`: as the argument `cost` of `design`.
-    - `max_steps`: of the optimiser.
-    - `compiled_bound`, `compiled_cost_and_slopes`: the methods of these names as compiled programs.
     """
 
     lidar: Lidar
     free_values: FreeValues
     noises: list[Any]
-    names: tuple[str, ...]
-    shapes: tuple[tuple[int, ...], ...]
-    labels: tuple[str, ...]
-    cost_of_bound: Cost
-    max_steps: int
-    compiled_bound: Callable[[Array, TracedScene, Any], CramerRao] = eqx.field(init=False)
-    compiled_cost_and_slopes: Callable[[Array, TracedScene, Any], tuple[Array, Array]] = eqx.field(init=False)
-
-    def __post_init__(self) -> None:
-        # By closures, not as compiled methods: the lidar and the limits are constants of the programs, where
-        # those of an object would be arguments of each of hundreds of calls.
-        self.compiled_bound = eqx.filter_jit(lambda *arguments: self.bound(*arguments))
-        self.compiled_cost_and_slopes = eqx.filter_jit(lambda *arguments: self.cost_and_slopes(*arguments))
+    names: tuple[str, ...] = eqx.field(static=True)
+    shapes: tuple[tuple[int, ...], ...] = eqx.field(static=True)
+    labels: tuple[str, ...] = eqx.field(static=True)
+    cost_of_bound: Cost | None
 
     def bound(self, flat: Array, traced: TracedScene, noise: Any) -> CramerRao:
         """Return the bound of one scene."""
         lidar = self.free_values.lidar_with(self.lidar, flat)
         return _cramer_rao(lidar, traced, noise, self.names, self.shapes, self.labels)
 
-    def bounds(self, flat: np.ndarray, traced_scenes: list[TracedScene]) -> tuple[CramerRao, ...]:
-        """Return the bounds of all scenes."""
-        return tuple(
-            self.compiled_bound(jnp.asarray(flat), *pair) for pair in zip(traced_scenes, self.noises)
-        )
-
     def scene_cost(self, flat: Array, traced: TracedScene, noise: Any) -> Array:
         """Return the cost of one scene."""
-        return jnp.asarray(self.cost_of_bound(self.compiled_bound(flat, traced, noise))).reshape(())
+        bound = self.bound(flat, traced, noise)
+        cost = _relative_variance(bound, traced) if self.cost_of_bound is None else self.cost_of_bound(bound)
+        return jnp.asarray(cost).reshape(())
 
-    def cost_and_slopes(self, fraction: Array, traced: TracedScene, noise: Any) -> tuple[Array, Array]:
-        """Return the cost of one scene, and its gradient by fractions."""
-
-        def cost_at(fraction: Array) -> Array:
-            low, high = jnp.asarray(self.free_values.low), jnp.asarray(self.free_values.high)
-            return self.scene_cost(low + fraction * (high - low), traced, noise)
-
-        return jax.value_and_grad(cost_at)(fraction)
+    def bounds(self, flat: np.ndarray, traced_scenes: list[TracedScene]) -> tuple[CramerRao, ...]:
+        """Return the bounds of all scenes."""
+        pairs = zip(traced_scenes, self.noises)
+        return tuple(_bound(self, jnp.asarray(flat), *pair) for pair in pairs)
 
     def mean_cost(self, flat: np.ndarray, traced_scenes: list[TracedScene]) -> float:
         """Return the mean cost over scenes."""
         pairs = zip(traced_scenes, self.noises)
-        return float(np.mean([float(self.scene_cost(jnp.asarray(flat), *pair)) for pair in pairs]))
+        return float(np.mean([float(_scene_cost(self, jnp.asarray(flat), *pair)) for pair in pairs]))
 
     def log_mean_cost(
-        self, fraction: np.ndarray, traced_scenes: list[TracedScene]
+        self, fraction: np.ndarray, cost_and_slopes: Sequence[Callable]
     ) -> tuple[float, np.ndarray]:
-        """Return the logarithm of the mean cost over scenes, and its gradient by fractions."""
-        pairs = zip(traced_scenes, self.noises)
-        terms = [self.compiled_cost_and_slopes(jnp.asarray(fraction), *pair) for pair in pairs]
+        """Return the logarithm of the mean cost over scenes, and its gradient by fractions.
+
+        `cost_and_slopes`: of each scene, a function of the fractions.
+        """
+        terms = [function(fraction=jnp.asarray(fraction)) for function in cost_and_slopes]
         mean = float(np.mean([float(value) for value, _ in terms]))
         slopes = np.mean([np.asarray(slope, float) for _, slope in terms], axis=0)
         # The bounds are infinite where an unknown leaves no trace in the record. The line search of the
@@ -293,20 +278,29 @@ class _DesignProblem(eqx.Module):
         return float(np.log(mean)), slopes / mean
 
     def minimise(
-        self, fraction: np.ndarray, traced_scenes: list[TracedScene], lower: np.ndarray, upper: np.ndarray
+        self,
+        fraction: np.ndarray,
+        traced_scenes: list[TracedScene],
+        lower: np.ndarray,
+        upper: np.ndarray,
+        max_steps: int,
     ) -> Any:
         """Minimise the logarithm of the mean cost from a start, between fractions of the limits."""
+        pairs = zip(traced_scenes, self.noises)
+        cost_and_slopes = [
+            _cost_and_slopes.bind(problem=self, traced=traced, noise=noise) for traced, noise in pairs
+        ]
         # The cost is as precise as JAX's default float: steps below its rounding are noise, in which the line
         # search fails. In double precision it is the optimiser's own tolerance.
         tolerance = max(_ROUNDINGS * float(jnp.finfo(jnp.result_type(float)).eps), _FINEST_TOLERANCE)
         return scipy.optimize.minimize(
             self.log_mean_cost,
             fraction,
-            args=(traced_scenes,),
+            args=(cost_and_slopes,),
             jac=True,
             method="L-BFGS-B",
             bounds=np.stack([lower, upper], axis=1),
-            options={"maxiter": self.max_steps, "ftol": tolerance},
+            options={"maxiter": max_steps, "ftol": tolerance},
         )
 
     def limits_near(
@@ -353,6 +347,25 @@ class _DesignProblem(eqx.Module):
                     "rays or photons, help"
                 )
                 return traced_scenes
+
+
+@Program
+def _bound(problem: _DesignProblem, flat: Array, traced: TracedScene, noise: Any) -> CramerRao:
+    return problem.bound(flat, traced, noise)
+
+
+@Program
+def _scene_cost(problem: _DesignProblem, flat: Array, traced: TracedScene, noise: Any) -> Array:
+    return problem.scene_cost(flat, traced, noise)
+
+
+@Program
+def _cost_and_slopes(
+    problem: _DesignProblem, traced: TracedScene, noise: Any, fraction: Array
+) -> tuple[Array, Array]:
+    """Return the cost of one scene, and its gradient by fractions."""
+    low, high = jnp.asarray(problem.free_values.low), jnp.asarray(problem.free_values.high)
+    return jax.value_and_grad(lambda x: problem.scene_cost(low + x * (high - low), traced, noise))(fraction)
 
 
 def _interpolation_error(
@@ -475,8 +488,7 @@ def design(
         names=tuple(unknown.name for unknown in bound_unknowns[0]),
         shapes=tuple(unknown.start.shape for unknown in bound_unknowns[0]),
         labels=flat_labels(bound_unknowns[0]),
-        cost_of_bound=_relative_variance(traced_scenes[0].width) if cost is None else cost,
-        max_steps=max_steps,
+        cost_of_bound=cost,
     )
     start = free_values.flat_of(lidar)
     initial_cost = problem.mean_cost(start, traced_scenes)
@@ -488,7 +500,7 @@ def design(
     drawn = np.asarray(jax.random.uniform(start_key, (starts - 1, start.size)), float)
     # The cost has minima at each absorption band: one start would end in the next of them.
     ends = [
-        problem.minimise(fraction, traced_scenes, lower, upper)
+        problem.minimise(fraction, traced_scenes, lower, upper, max_steps)
         for fraction in [free_values.fraction_of(start), *drawn]
     ]
     costs = np.exp([end.fun for end in ends])
@@ -500,7 +512,7 @@ def design(
         flat = free_values.at_fraction(best.x)
         lower, upper = problem.limits_near(flat, lower, upper)
         traced_scenes = problem.trace_divergences(tracer, lower, upper, flat, _FINE_TOLERANCE)
-        best = problem.minimise(best.x, traced_scenes, lower, upper)
+        best = problem.minimise(best.x, traced_scenes, lower, upper, max_steps)
     flat = free_values.at_fraction(np.clip(best.x, 0.0, 1.0))
     best_lidar, best_cost = free_values.lidar_with(lidar, jnp.asarray(flat)), float(np.exp(best.fun))
     if varies_divergence:
@@ -589,7 +601,13 @@ def _plan(
 
 def _plan_of_limits(cases: list[tuple[Lidar, Scene]], **options: Any) -> Plan:
     try:
-        return plan_cases(cases, window=None, **options)
+        plan = plan_cases(cases, window=None, **options)
+        # A size bucket of samples, so that a change of a number compiles nothing. Samples without light
+        # determine nothing.
+        count = size_bucket(plan.n_samples)
+        end = plan.sample_start + (count - 1 + 1e-3) * plan.sample_interval
+        is_full = count == plan.n_samples
+        return plan if is_full else plan_cases(cases, window=(plan.sample_start, end), **options)
     except ValueError as error:
         raise ValueError(f"at the limits a lidar or a scene is inadmissible: {error}") from error
 
@@ -616,10 +634,12 @@ def _noise_of_samples(
     lidar, is_free = traced.inputs.lidar, traced.n_samples is not None
     if noise is None:
         response, _ = traced.at(lidar.divergence)
-        reflectance = eqx.filter_jit(TracedScene.record)(traced, lidar, response, traced.values)
+        reflectance = _record(traced, lidar, response, traced.values)
         noise = _NOISE_FRACTION * float(jnp.max(reflectance))
         if is_free:
-            return _white_noise(noise / math.sqrt(float(lidar.sampling_interval)))
+            return jax.tree_util.Partial(
+                _white_noise, jnp.asarray(noise / math.sqrt(float(lidar.sampling_interval)))
+            )
     sigma = as_numpy(noise, "noise")
     # Samples of a free interval have no fixed place in the record.
     shape = (lidar.wavelength.size, 1 if is_free else plan.n_samples)
@@ -632,25 +652,20 @@ def _noise_of_samples(
     return jnp.asarray(sigma)
 
 
-def _white_noise(density: float) -> Callable[[Lidar, Array], Array]:
+_record = Program(TracedScene.record)
+
+
+def _white_noise(density: Array, lidar: Lidar, reflectance: Array) -> Array:
     """Return noise that is white: its standard deviation grows with the root of the sampling interval.
 
     `density`: standard deviation of a sample of 1 ns.
     """
-
-    def noise(lidar: Lidar, reflectance: Array) -> Array:
-        return density * jnp.sqrt(lidar.sampling_interval) * jnp.ones_like(reflectance)
-
-    return noise
+    return density * jnp.sqrt(lidar.sampling_interval) * jnp.ones_like(reflectance)
 
 
-def _relative_variance(width: Float[Array, " n"]) -> Cost:
+def _relative_variance(bound: CramerRao, traced: TracedScene) -> Array:
     """Return the default cost: the sum of squared standard errors over the widths of the bounds."""
-
-    def cost(bound: CramerRao) -> Array:
-        return jnp.sum(jnp.diag(bound.covariance) / width**2)
-
-    return cost
+    return jnp.sum(jnp.diag(bound.covariance) / traced.width**2)
 
 
 def _cramer_rao(

@@ -27,7 +27,7 @@ from inversion.fit.planning import N_BATCHES
 from inversion.fit.prior_residuals import fixed_priors
 from inversion.fit.unknowns import BoundUnknown, flat_bounds, flat_start
 from jaxlidar import Lidar, Plan, Scene, total_reflectance, trace_scene
-from jaxlidar.extend import tensordot
+from jaxlidar.extend import Program, tensordot
 from jaxlidar.spectral.apply_optics import make_free_sampling_model, total_samples
 from jaxlidar.trace.response import Response
 
@@ -166,7 +166,7 @@ def _trace_divergences(
     return jax.tree.map(lambda *arrays: jnp.stack(arrays), *traces)
 
 
-@eqx.filter_jit
+@Program
 def _response_and_slopes(inputs: SimulationInputs, values: Values, keys: Array) -> tuple[Response, Response]:
     """Return the mean response of all batches, and its derivatives by all flattened unknowns."""
     flat, restore = jax.flatten_util.ravel_pytree(values)
