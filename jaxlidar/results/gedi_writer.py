@@ -113,8 +113,9 @@ def write_gedi_l1b(
     **Arguments:**
 
     - `path`: the HDF5 file to write. It appears when it is complete. Missing folders are created.
-    - `waveforms`: the `Waveforms` of `jaxlidar.simulate_many`, or one `Waveform` for each shot, of one
-      wavelength and samples of 1 ns. Their `recorded` energies are written.
+    - `waveforms`: the `Waveforms` of `jaxlidar.simulate_many`, a list of such whose shots follow one another,
+      or a list of one `Waveform` for each shot, of one wavelength and samples of 1 ns. Their `recorded`
+      energies are written.
     - `survey`: the `Survey` that was simulated; `Survey.of(lidar)` for one waveform.
     - `origin`: longitude and latitude of x = y = 0 in degrees, where y is north. Positions are those of the
       azimuthal equidistant projection about it.
@@ -168,7 +169,8 @@ def write_gedi_l1b(
         import h5py
     check_kind("survey", survey, Survey, "a Survey, such as Survey.of(lidar)")
     margin = check_integer("margin", margin, 0)
-    first_time, bins = _spans(waveforms, survey, margin)
+    parts = _parts(waveforms)
+    first_time, bins = _spans(parts, survey, margin)
     shots = len(survey)
     check_range("elevation", elevation)
     check_shape("elevation", elevation, (), (shots,))
@@ -212,7 +214,9 @@ def write_gedi_l1b(
     columns["rx_offset"] = rx_offset.astype(np.uint16)
     columns["rx_open"] = (first_sample - rx_offset).astype(np.uint32)
     digitiser = _Digitiser(
-        waveforms=waveforms,
+        recorded=[
+            row for part in parts for row in (part.recorded[:, 0] if _is_survey(part) else part.recorded)
+        ],
         per_joule=per_joule,
         noise_mean=noise_mean,
         noise_std=noise_std,
@@ -283,13 +287,13 @@ def _write_received(group: Any, digitiser: "_Digitiser", indices: np.ndarray) ->
 class _Digitiser:
     """The digitiser of all shots, counts = `noise_mean` + `per_joule` * energy + noise.
 
-    - `waveforms`: `Waveforms`, or a sequence of `Waveform`.
+    - `recorded`: energies of each shot, J, without a margin.
     - `per_joule`: (shots,) counts per J.
     - `noise_mean`, `noise_std`: counts. `key`: of the noise; None for none.
     - `bins`: (shots,) number of bins, of which `margin` at either end have only the `background`, J.
     """
 
-    waveforms: Any
+    recorded: Sequence[Any]
     per_joule: np.ndarray
     noise_mean: float
     noise_std: float
@@ -307,9 +311,7 @@ class _Digitiser:
         return [self._shot_counts(int(i), row[: self.bins[i]]) for i, row in zip(shots, noise)]
 
     def _shot_counts(self, i: int, noise: np.ndarray) -> np.ndarray:
-        is_survey = hasattr(self.waveforms, "position")
-        energy = self.waveforms.recorded[i, 0] if is_survey else self.waveforms[i].recorded[0]
-        energy = np.asarray(energy, float)
+        energy = np.asarray(self.recorded[i], float)
         check_range(f"recorded of shot {i}", energy)
         energy = np.pad(energy, self.margin, constant_values=self.background)
         counts = self.noise_mean + self.per_joule[i] * energy + noise
@@ -320,7 +322,23 @@ class _Digitiser:
         return counts.astype(np.float32)
 
 
-def _spans(waveforms: Any, survey: Survey, margin: int) -> tuple[np.ndarray, np.ndarray]:
+def _is_survey(waves: Any) -> bool:
+    """Return True for the `Waveforms` of a survey, which this package does not import."""
+    return hasattr(waves, "position")
+
+
+def _parts(waveforms: Any) -> list[Any]:
+    """Return the `Waveforms`, or the `Waveform`s, of which waveforms consist. **Raises:** TypeError."""
+    if _is_survey(waveforms):
+        return [waveforms]
+    check_kind("waveforms", waveforms, Sequence, "the Waveforms of simulate_many, or a list of Waveform")
+    for i, part in enumerate(waveforms):
+        if not _is_survey(part):
+            check_kind(f"waveforms {i}", part, Waveform, "a Waveform, or Waveforms")
+    return list(waveforms)
+
+
+def _spans(parts: list[Any], survey: Survey, margin: int) -> tuple[np.ndarray, np.ndarray]:
     """Return the time of the first bin in ns, and the number of bins, of each shot.
 
     **Raises:** as `write_gedi_l1b`.
@@ -330,24 +348,21 @@ def _spans(waveforms: Any, survey: Survey, margin: int) -> tuple[np.ndarray, np.
         raise ValueError(
             f"survey: its shots are placed {placed}; admissible is one altitude, as an orbit has"
         )
-    position = getattr(waveforms, "position", None)
-    if position is None:
-        check_kind("waveforms", waveforms, Sequence, "the Waveforms of simulate_many, or a list of Waveform")
-        for i, wave in enumerate(waveforms):
-            check_kind(f"waveforms {i}", wave, Waveform, "a Waveform")
-    if len(waveforms) != len(survey):
-        raise ValueError(f"{len(waveforms)} waveforms are of a survey of {len(survey)} shots; give its own")
-    if position is not None and not np.array_equal(position, survey.position):
-        raise ValueError("the waveforms have another position than the shots of the survey; give their own")
-    if position is not None:
-        spans = [_span(waveforms, "waveforms", margin)] * len(survey)
-        _check_lidar(waveforms, "waveforms", _lidar_of(survey))
-        _check_directions(waveforms, survey)
-    else:
-        spans = [_span(wave, f"waveforms {i}", margin) for i, wave in enumerate(waveforms)]
-        for i, wave in enumerate(waveforms):
-            _check_lidar(wave, f"waveforms {i}", _lidar_of(survey))
-            _check_zenith(wave, f"waveforms {i}", float(survey.zenith[i]))
+    counts = [len(part) if _is_survey(part) else 1 for part in parts]
+    if sum(counts) != len(survey):
+        raise ValueError(f"{sum(counts)} waveforms are of a survey of {len(survey)} shots; give its own")
+    lidar, spans, end = _lidar_of(survey), [], 0
+    for i, (part, count) in enumerate(zip(parts, counts)):
+        name = "waveforms" if _is_survey(part) and len(parts) == 1 else f"waveforms {i}"
+        start, end = end, end + count
+        if _is_survey(part) and not np.array_equal(part.position, survey.position[start:end]):
+            raise ValueError(f"{name}: they have another position than the shots of the survey")
+        spans += [_span(part, name, margin)] * count
+        _check_lidar(part, name, lidar)
+        if _is_survey(part):
+            _check_directions(part, name, survey.subset(slice(start, end)))
+        else:
+            _check_zenith(part, name, float(survey.zenith[start]))
     first_times, bins = zip(*spans)
     return np.array(first_times), np.array(bins)
 
@@ -377,7 +392,7 @@ def _check_lidar(waves: Any, name: str, lidar: Lidar) -> None:
             )
 
 
-def _check_directions(waves: Any, survey: Survey) -> None:
+def _check_directions(waves: Any, name: str, survey: Survey) -> None:
     """Refuse `Waveforms` of other directions than those of the survey's shots."""
     turn = np.remainder(np.asarray(waves.azimuth) - survey.azimuth + 180.0, 360.0) - 180.0
     differences = {
@@ -389,7 +404,7 @@ def _check_directions(waves: Any, survey: Survey) -> None:
         if np.any(difference > _MAX_TURN):
             i = int(np.argmax(difference > _MAX_TURN))
             raise ValueError(
-                f"waveforms: shot {i} has the {angle} {getattr(waves, angle)[i]:g} degrees, that of the "
+                f"{name}: shot {i} has the {angle} {getattr(waves, angle)[i]:g} degrees, that of the "
                 f"survey {getattr(survey, angle)[i]:g} degrees; give the survey that was simulated"
             )
 

@@ -82,6 +82,25 @@ def test_a_list_of_waveforms_makes_the_same_file(waveforms, survey, path, tmp_pa
         assert all(np.array_equal(file[name], file_of_list[name]) for name in datasets)
 
 
+def test_waveforms_in_parts_make_the_same_file(waveforms, survey, path, tmp_path):
+    """Parts of a survey may have time axes of their own: here all have the axis of the whole."""
+    parts = [
+        jax.tree.map(lambda a, rows=rows: a[rows] if len(a) == 4 else a, waveforms)
+        for rows in (slice(3), slice(3, 4))
+    ]
+    assert [len(part) for part in parts] == [3, 1]
+    noise = {"key": jax.random.key(2)}
+    write_gedi_l1b(path, waveforms, survey, **GEOGRAPHIC_PLACE, **noise)
+    write_gedi_l1b(tmp_path / "parts.h5", parts, survey, **GEOGRAPHIC_PLACE, **noise)
+    for shot, other in zip(read_gedi_l1b(path), read_gedi_l1b(tmp_path / "parts.h5"), strict=True):
+        assert np.array_equal(shot.waveform, other.waveform)
+        assert np.array_equal(shot.elevation, other.elevation)
+    with pytest.raises(ValueError, match="waveforms 0: they have another position"):
+        write_gedi_l1b(path, parts[::-1], survey, **GEOGRAPHIC_PLACE)
+    with pytest.raises(ValueError, match="3 waveforms are of a survey of 4"):
+        write_gedi_l1b(path, parts[:1], survey, **GEOGRAPHIC_PLACE)
+
+
 def test_waveforms_of_different_lengths_and_a_rectangular_pulse(waveforms, path):
     bins, second = slice(20, 150), waveforms[1]
     shortened = {name: getattr(second, name)[:, bins] for name in ("reflectance", "recorded")}
