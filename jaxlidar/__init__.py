@@ -21,7 +21,7 @@ waveforms is in the package `inversion`.
 ## Surveys of many shots
 
 `Survey`, `Trajectory`, `AbstractScan`, `Oscillating`, `RotatingPolygon`, `Conical`, `ground_position`,
-`simulate_many`, `Waveforms`, `SceneParts`, `DiscreteReturns`.
+`simulate_many`, `simulate_tiles`, `Waveforms`, `SceneParts`, `DiscreteReturns`.
 
 ## Many scenes
 
@@ -139,6 +139,7 @@ from jaxlidar.simulation.one_scene import LateLightWarning, UnfollowedLightWarni
 from jaxlidar.simulation.reflectance import plan_reflectance, reflectance_factor
 from jaxlidar.simulation.truth import truth_of
 from jaxlidar.spectral.waveform import Waveform, total_reflectance, waveform_of
+from jaxlidar.survey.cloud_tiles import simulate_tiles
 from jaxlidar.survey.coverage import OffMapWarning, ground_position
 from jaxlidar.survey.returns import DiscreteReturns
 from jaxlidar.survey.simulate_many import simulate_many
@@ -180,6 +181,7 @@ __all__ = [
     "Conical",
     "ground_position",
     "simulate_many",
+    "simulate_tiles",
     "Waveforms",
     "SceneParts",
     "DiscreteReturns",

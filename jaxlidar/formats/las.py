@@ -142,6 +142,26 @@ def read_stored_points(
     return points, system
 
 
+def las_extent(path: Path) -> tuple[np.ndarray, np.ndarray, str | None]:
+    """Return the corners (3,) of the extent that a file's header states, m, and its reference system.
+
+    **Raises:** as `read_las`, but for what is wrong with the points; ValueError for an extent that is none.
+    """
+    with path.open("rb") as file:
+        header = read_header(path, file)
+        system = header.coordinate_system(path, file)
+    system.horizontal_length(f"{path}: header")
+    horizontal, vertical = system.lengths(f"{path}: header")
+    low, high = (np.array(ends) * [horizontal, horizontal, vertical] for ends in (header.low, header.high))
+    # Written so that NaN is refused.
+    if not (np.all(low <= high) and max(np.abs(low).max(), np.abs(high).max()) <= MAX_COORDINATE):
+        raise ValueError(
+            f"{path}: header: the extent from {low.tolist()} to {high.tolist()} m is none; admissible are "
+            f"coordinates up to {MAX_COORDINATE:g} m"
+        )
+    return low, high, system.map_name
+
+
 def _gps_time(cloud: Any, selected: np.ndarray) -> np.ndarray | None:
     """Return the GPS times of the selected points, s; None where the point format has none."""
     if "gps_time" not in cloud.point_format.dimension_names:

@@ -18,8 +18,9 @@ from jaxlidar.formats.checks import check_unpacked_size
 from jaxlidar.formats.coordinates import declared_system
 
 # The public header block: signature, version, sizes of header and point records, legacy number of points,
-# scales and offsets; from LAS 1.4 on, place and number of the extended records, and the number of points.
-_PUBLIC_BLOCK = struct.Struct("<4s20x2B68xHIIBHI20x3d3d")
+# scales and offsets, and the largest and smallest x, y and z; from LAS 1.4 on, place and number of the
+# extended records, and the number of points.
+_PUBLIC_BLOCK = struct.Struct("<4s20x2B68xHIIBHI20x3d3d6d")
 _EXTENDED_BLOCK, _EXTENDED_BLOCK_OFFSET = struct.Struct("<QIQ"), 235
 _HEADER_SIZES = {0: 227, 1: 227, 2: 227, 3: 235, 4: 375, 5: 393}
 # The header of a variable length record (user, number, length), and that of an extended one.
@@ -95,6 +96,7 @@ class LasHeader:
     - `point_format`: number of the point format, and `point_size`: bytes of a point record.
     - `points`: number of points, and `start`: offset of the first, in bytes.
     - `scales`, `offsets`: of x, y and z.
+    - `low`, `high`: smallest and largest x, y and z.
     - `laszip`: the variable length record that describes the compression of points; None where they are not
       compressed.
     - `records`: offsets and lengths of the variable length records, by user and number; the extended ones,
@@ -107,6 +109,8 @@ class LasHeader:
     start: int
     scales: tuple[float, ...]
     offsets: tuple[float, ...]
+    low: tuple[float, ...]
+    high: tuple[float, ...]
     laszip: bytes | None = None
     records: dict[tuple[bytes, int], list[tuple[int, int]]] = dataclasses.field(default_factory=dict)
 
@@ -147,10 +151,9 @@ def read_header(path: Path, file: BinaryIO) -> LasHeader:
     if len(block) < _PUBLIC_BLOCK.size:
         raise ValueError(f"{path}: header: the file ends after {size} bytes")
     fields = _PUBLIC_BLOCK.unpack_from(block)
-    _, major, minor, header_size, start, records, format_byte, point_size, points, *scales_and_offsets = (
-        fields
-    )
-    scales, offsets = tuple(scales_and_offsets[:3]), tuple(scales_and_offsets[3:])
+    _, major, minor, header_size, start, records, format_byte, point_size, points, *numbers = fields
+    # The ends of axes alternate, the largest first.
+    scales, offsets, high, low = map(tuple, (numbers[:3], numbers[3:6], numbers[6::2], numbers[7::2]))
     if major != 1 or minor not in _HEADER_SIZES:
         raise ValueError(f"{path}: header: version {major}.{minor} is none of LAS 1.0 to 1.5")
     if not _HEADER_SIZES[minor] <= header_size <= start <= size:
@@ -166,7 +169,8 @@ def read_header(path: Path, file: BinaryIO) -> LasHeader:
                 f"{path}: header: {extended_count} extended records from {extended} on do not fit into "
                 f"{size} bytes"
             )
-    header = LasHeader(format_byte & ~_COMPRESSED, point_size, points, start, scales, offsets)
+    point_format = format_byte & ~_COMPRESSED
+    header = LasHeader(point_format, point_size, points, start, scales, offsets, low, high)
     if header.point_format not in ITEMS or header.extra_bytes < 0:
         raise ValueError(f"{path}: header: point format {header.point_format}, records of {point_size} bytes")
     check_scales(f"{path}: header", "xyz", scales, offsets, _SCALES)

@@ -254,7 +254,9 @@ def _interception(
         return _moved_layers(hits, ground_layer), ground.sum(axis=2)
 
     area = float(grid.size[0] * grid.size[1])
-    returns_per_column = len(position) * area / float(np.prod(grid.size[:2] * grid.shape[:2]))
+    # Of the columns that the returns span: a given grid may be larger.
+    spanned = Grid.enclosing(position.min(axis=0), position.max(axis=0), grid.size, None, None)
+    returns_per_column = len(position) / float(np.prod(spanned.shape[:2]))
     # A Gaussian of the standard deviation s holds 2 pi s^2 times the density.
     sigma = np.sqrt(_SMOOTHED_RETURNS * area / (2.0 * np.pi * returns_per_column))
     counted_hits, counted_ground = (_smooth(a, sigma, grid) for a in sums(np.ones(len(position))))
