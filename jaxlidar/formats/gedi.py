@@ -47,6 +47,17 @@ from jaxlidar.formats.hdf5 import ProductFile, open_hdf5
 from jaxlidar.formats.noise import above_pedestal
 
 _PRODUCT = "GEDI L1B"
+# Groups of beams: the number of the laser's channel, and True for a beam with the full power of its laser.
+BEAMS = {
+    "BEAM0000": (0, False),
+    "BEAM0001": (0, False),
+    "BEAM0010": (1, False),
+    "BEAM0011": (1, False),
+    "BEAM0101": (2, True),
+    "BEAM0110": (3, True),
+    "BEAM1000": (4, True),
+    "BEAM1011": (5, True),
+}
 # Datasets of a beam's group with a number for each shot; start indices of samples may be missing.
 _PER_SHOT = (
     "rx_sample_count",

@@ -37,22 +37,12 @@ from jaxlidar._fingerprint import version_of
 from jaxlidar.formats.checks import MAX_COUNTS
 from jaxlidar.formats.coordinates import GEOGRAPHIC
 from jaxlidar.formats.files import atomic_write
+from jaxlidar.formats.gedi import BEAMS
 from jaxlidar.sensors.lidar import Lidar
 from jaxlidar.sensors.receiver import Receiver
 from jaxlidar.sensors.survey import Survey
 from jaxlidar.spectral.waveform import Waveform, energy_at_reference
 
-# Groups of beams: the number of the laser's channel, and True for a beam with the full power of its laser.
-_BEAMS = {
-    "BEAM0000": (0, False),
-    "BEAM0001": (0, False),
-    "BEAM0010": (1, False),
-    "BEAM0011": (1, False),
-    "BEAM0101": (2, True),
-    "BEAM0110": (3, True),
-    "BEAM1000": (4, True),
-    "BEAM1011": (5, True),
-}
 # Digits of shot numbers: orbit, beam (2), reserved (3) and number within the orbit (8).
 _ORBIT_DIGIT, _BEAM_DIGIT = 10**13, 10**11
 # Shots per second of one beam.
@@ -178,7 +168,7 @@ def write_gedi_l1b(
     beams = np.array([beam] * shots if isinstance(beam, str) else list(beam))
     check_shape("beam", beams, (shots,))
     for name in np.unique(beams):
-        check_choice("beam", str(name), tuple(_BEAMS))
+        check_choice("beam", str(name), tuple(BEAMS))
     check_number("gain", gain, 0.0, low_open=True)
     check_number("noise_mean", noise_mean, 0.0)
     check_number("noise_std", noise_std, 0.0)
@@ -227,7 +217,7 @@ def write_gedi_l1b(
     )
     with atomic_write(path) as draft, h5py.File(draft, "w") as file:
         _write_description(file, Path(path).name)
-        for name in _BEAMS:
+        for name in BEAMS:
             (indices,) = np.nonzero(beams == name)
             # Tools take a group for a beam with shots.
             if indices.size == 0:
@@ -249,7 +239,7 @@ def write_gedi_l1b(
 
 def _write_beam(file: Any, name: str, columns: dict[str, np.ndarray]) -> Any:
     """Write the group of a beam but for its waveforms and their geolocation, and return it."""
-    channel, is_full_power = _BEAMS[name]
+    channel, is_full_power = BEAMS[name]
     group = file.create_group(name)
     group.attrs["description"] = _attribute(f"{'Full power' if is_full_power else 'Coverage'} beam")
     shots = len(columns["shot_number"])
