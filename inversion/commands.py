@@ -1,12 +1,17 @@
-"""The commands `jaxlidar demo`, `jaxlidar retrieve` and `jaxlidar gedi`.
+"""The commands `jaxlidar demo`, `jaxlidar retrieve`, `jaxlidar gedi` and `jaxlidar footprints`.
 
 `jaxlidar` never imports this package: its command line finds the commands by the group of entry points
 "jaxlidar.commands" in pyproject.toml.
 """
 
+import contextlib
 import math
+import multiprocessing
+import shutil
 import sys
 import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import Executor, ProcessPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -19,12 +24,15 @@ from inversion import demo as demonstration
 from inversion.fit.problem import Problem
 from inversion.fit.retrieval import retrieve as fit_waveform
 from inversion.fit.unknowns import Unknown
+from inversion.footprints import simulate_footprints
 from inversion.metrics.gedi_table import gedi_table
 from jaxlidar.cli.constants import INTERRUPTED, SUCCESS
-from jaxlidar.cli.shared import ResultPath, save_figure
+from jaxlidar.cli.shared import QUIET_OPTION, ResultPath, save_figure
 from jaxlidar.formats.tables import TABLE_FORMATS
 from jaxlidar.results.store import remove_store, store_beside
 
+# Endings of files of points, and the most footprints outside of them that are named.
+_CLOUD_SUFFIXES, _NAMED = (".las", ".laz"), 10
 # Seconds between lines of progress in a log file.
 _LOG_SECONDS = 5.0
 
@@ -134,9 +142,9 @@ def retrieve(
     return 0 if fit.converged else 1
 
 
-def _check_table_path(ctx: Any, parameter: Any, path: Path) -> Path:
+def _check_table_path(ctx: Any, parameter: Any, path: Path | None) -> Path | None:
     """Refuse a name that ends in no format of tables, before the work."""
-    if path.suffix.lower() not in TABLE_FORMATS:
+    if path is not None and path.suffix.lower() not in TABLE_FORMATS:
         raise click.BadParameter(f"{str(path)!r} ends in none of {', '.join(TABLE_FORMATS)}")
     return path
 
@@ -176,6 +184,24 @@ def gedi(files: tuple[Path, ...], out: Path, group: int, fit: bool, quiet: bool)
       jaxlidar gedi GEDI01_B_2019108080338_O01964_T05337_02_003_01.h5 -o shots.csv
     """
     store = store_beside(out) if fit else None
+    try:
+        table = gedi_table(list(files), group=group, fit=fit, path=store, progress=_progress_lines(quiet))
+    except KeyboardInterrupt:
+        if store is None:
+            raise
+        message = f"finished fits are kept in {store}: the same command continues with them"
+        click.echo(f"jaxlidar: interrupted; {message}", err=True)
+        return INTERRUPTED
+    table.save(out)
+    # All that it held is in the table.
+    if store is not None:
+        remove_store(store)
+    click.echo(f"{len(table)} shots: {_qualities(table)}; written: {out}")
+    return SUCCESS
+
+
+def _progress_lines(quiet: bool) -> Callable[[Any], None] | None:
+    """Return a function that prints reports of progress on the standard error; None for quiet."""
     is_terminal = sys.stderr.isatty()
     last_time = time.perf_counter()
 
@@ -189,20 +215,167 @@ def gedi(files: tuple[Path, ...], out: Path, group: int, fit: bool, quiet: bool)
             click.echo(str(progress), err=True)
             last_time = time.perf_counter()
 
-    show = None if quiet else report
+    return None if quiet else report
+
+
+def _qualities(table: Any) -> str:
+    """Return how many rows of a table have each quality."""
+    qualities, counts = np.unique(table["quality"], return_counts=True)
+    return ", ".join(f"{count} {quality}" for quality, count in zip(qualities, counts))
+
+
+# -- footprints --------------------------------------------------------------------------------------------
+
+
+def _split_inputs(ctx: Any, parameter: Any, paths: tuple[Path, ...]) -> tuple[list[Path], Path]:
+    """Return the files of points, and the one file of places."""
+    clouds = [path for path in paths if path.suffix.lower() in _CLOUD_SUFFIXES]
+    places = [path for path in paths if path not in clouds]
+    if not clouds or len(places) != 1:
+        raise click.BadParameter(
+            f"{len(clouds)} files of points (.las, .laz) and {len(places)} of places; admissible are one or "
+            "more, and one"
+        )
+    return clouds, places[0]
+
+
+def _lidar_of_name(ctx: Any, parameter: Any, name: str) -> jl.Lidar:
+    """Return the lidar of a name; that of a mission is its full-power beam by night."""
     try:
-        table = gedi_table(list(files), group=group, fit=fit, path=store, progress=show)
+        return jl.instrument(f"{name} power" if f"{name} power" in jl.instruments() else name)
+    except ValueError as error:
+        raise click.BadParameter(str(error)) from None
+
+
+@contextlib.contextmanager
+def _executor(workers: str | None) -> Iterator[Executor | None]:
+    """Give processes of this machine by their number, or the workers of a Dask scheduler by its address."""
+    if workers is None:
+        yield None
+    elif workers.isdigit():
+        if workers == "0":
+            raise click.BadParameter("0 workers; admissible is 1 or more", param_hint="--workers")
+        with ProcessPoolExecutor(int(workers), multiprocessing.get_context("spawn")) as executor:
+            yield executor
+    else:
+        try:
+            from distributed import Client  # pyright: ignore[reportMissingImports]
+        except ImportError as error:
+            raise ImportError('workers of Dask need distributed: pip install "jaxlidar[cluster]"') from error
+        with Client(workers) as client:
+            yield client.get_executor()
+
+
+@click.command()
+@click.argument(
+    "inputs",
+    nargs=-1,
+    required=True,
+    type=click.Path(exists=True, dir_okay=False, path_type=Path),
+    callback=_split_inputs,
+    metavar="CLOUD.laz... PLACES",
+)
+@click.option(
+    "-o",
+    "--out",
+    required=True,
+    type=click.Path(dir_okay=False, path_type=Path),
+    help="Level 1B file to write (.h5).",
+)
+@click.option(
+    "--table",
+    "table_path",
+    type=click.Path(dir_okay=False, path_type=Path),
+    callback=_check_table_path,
+    help="Table to write: .csv, .nc, .parquet or .gpkg.  [default: beside the file, .csv]",
+)
+@click.option(
+    "--instrument",
+    "lidar",
+    default="GEDI",
+    callback=_lidar_of_name,
+    help="Name of a lidar: jl.instruments().",
+)
+@click.option("--link-margin", type=float, help="Link margin of the noise, dB.  [default: no noise]")
+@click.option(
+    "--link-cover",
+    type=click.FloatRange(0, 1, max_open=True),
+    default=0.95,
+    help="Canopy cover at which the link margin holds.",
+)
+@click.option(
+    "--geolocation-error",
+    type=click.FloatRange(0),
+    default=0.0,
+    help="Standard deviation of the stated places about the true ones, m.",
+)
+@click.option("--crs", help="Coordinate reference system of files that declare none, such as EPSG:32633.")
+@click.option("--seed", type=click.IntRange(0, 2**31 - 1), default=0, help="Seed of light, noise and errors.")
+@click.option("--workers", help="Processes (a number), or the address of a Dask scheduler.")
+@QUIET_OPTION
+def footprints(
+    inputs: tuple[list[Path], Path],
+    out: Path,
+    table_path: Path | None,
+    lidar: jl.Lidar,
+    link_margin: float | None,
+    link_cover: float,
+    geolocation_error: float,
+    crs: str | None,
+    seed: int,
+    workers: str | None,
+    quiet: bool,
+) -> int:
+    """Simulate spaceborne footprints over airborne point clouds.
+
+    Writes a GEDI level 1B file, and a table of each footprint: metrics without noise and with it, under the
+    names of the GEDI simulator, and those of `jaxlidar gedi`. PLACES is a table (.csv) with columns x and y,
+    or longitude and latitude, and optionally shot_number and beam; or a GEDI level 1B or 2A file (.h5).
+
+    A link margin is 10 log10 of what the echo of the ground below the given cover exceeds the noise by, over
+    the threshold: at 0 dB nine of ten grounds are found, and one false one in 20 records of 30 m.
+
+    Clouds are simulated tile by tile. If it is interrupted, the same command continues with the tiles that
+    have ended.
+
+    \b
+    Example:
+      jaxlidar footprints tiles/*.laz shots.csv -o l1b.h5 --instrument GEDI --link-margin 3
+    """
+    clouds, places = inputs
+    table_path = table_path or out.with_suffix(".csv")
+    if out.suffix.lower() not in (".h5", ".hdf5"):
+        raise click.BadParameter(f"{str(out)!r} does not end in .h5", param_hint="--out")
+    if places.resolve() in (out.resolve(), table_path.resolve()):
+        raise click.BadParameter(f"{places} would be overwritten", param_hint="--out")
+    folder = out.with_name(out.name + ".tiles")
+    try:
+        with _executor(workers) as executor:
+            table = simulate_footprints(
+                clouds,
+                places,
+                out,
+                folder,
+                lidar=lidar,
+                link_margin=link_margin,
+                cover=link_cover,
+                geolocation_error=geolocation_error,
+                crs=crs,
+                seed=seed,
+                executor=executor,
+                progress=_progress_lines(quiet),
+            )
     except KeyboardInterrupt:
-        if store is None:
-            raise
-        message = f"finished fits are kept in {store}: the same command continues with them"
+        message = f"finished tiles are kept in {folder}: the same command continues with them"
         click.echo(f"jaxlidar: interrupted; {message}", err=True)
         return INTERRUPTED
-    table.save(out)
-    # All that it held is in the table.
-    if store is not None:
-        remove_store(store)
-    qualities, counts = np.unique(table["quality"], return_counts=True)
-    summary = ", ".join(f"{count} {quality}" for quality, count in zip(qualities, counts))
-    click.echo(f"{len(table)} shots: {summary}; written: {out}")
+    table.save(table_path)
+    # All that it held is in the file and the table.
+    shutil.rmtree(folder, ignore_errors=True)
+    click.echo(f"{len(table)} footprints: {_qualities(table)}; written: {out}, {table_path}")
+    (outside,) = np.nonzero(np.isnan(table["covered"]))
+    if outside.size:
+        numbers = ", ".join(map(str, table["shot_number"][outside[:_NAMED]]))
+        more = f" and {outside.size - _NAMED} more" if outside.size > _NAMED else ""
+        click.echo(f"outside of all files of points: {outside.size} footprints, {numbers}{more}")
     return SUCCESS

@@ -1,8 +1,8 @@
 """The command `jaxlidar`: `jaxlidar --help` lists its commands, `jaxlidar COMMAND --help` has examples.
 
 Besides the commands of this package, every entry point of the group `jaxlidar.commands` is a command (a
-`click.Command`), so that packages on top of this one can add theirs: `demo`, `retrieve` and `gedi` come from
-the package `inversion`.
+`click.Command`), so that packages on top of this one can add theirs: `demo`, `retrieve`, `gedi` and
+`footprints` come from the package `inversion`.
 
 Exit statuses: 0 success; 1 failure (a sentence on the standard error says why); 2 wrong usage; 130
 interrupted (results until then are saved where the command says so).
