@@ -42,12 +42,8 @@ def tree_scene() -> tuple[jl.Scene, jl.MeshSurface]:
 
 def scan(step: float) -> jl.Survey:
     """Return the shots of a turning scanner that looks at the tree, `step` degrees apart both ways."""
-    lidar = jl.instrument("RIEGL VZ-400")
-    azimuth, elevation = np.arange(-32.0, 32.0 + step, step), np.arange(-12.0, 56.0 + step, step)
-    # The head looks along one vertical line after the other.
-    azimuth, elevation = (a.ravel() for a in np.meshgrid(azimuth, elevation, indexing="ij"))
-    sensor = np.tile(SENSOR, (azimuth.size, 1))
-    return jl.Survey(lidar, sensor=sensor, zenith=90.0 + elevation, azimuth=azimuth)
+    scanner = jl.instrument("RIEGL VZ-400").at(SENSOR)
+    return jl.Survey.scan(scanner, jl.Panorama(zenith=(78.0, 146.0), azimuth=(-32.0, 32.0), step=step))
 
 
 def profiles(
@@ -67,11 +63,12 @@ def draw(survey: jl.Survey, returns: jl.DiscreteReturns, leaves: jl.MeshSurface,
     figure = plt.figure(figsize=(12.5, 4.3), layout="constrained")
     view, side, profile = figure.subplots(1, 3, width_ratios=(1.1, 1.0, 0.75))
     is_first = returns.number == 1
-    shot = returns.shot[is_first]
-    azimuth, column = np.unique(np.asarray(survey.azimuth), return_inverse=True)
-    elevation, row = np.unique(np.asarray(survey.zenith) - 90.0, return_inverse=True)
-    distance = np.full((elevation.size, azimuth.size), np.nan)
-    distance[row[shot], column[shot]] = returns.range[is_first]
+    distance = np.full(len(survey), np.nan)
+    distance[returns.shot[is_first]] = returns.range[is_first]
+    elevation = np.unique((survey.zenith - 90.0).round(6))
+    # Lines of the head, from left to right.
+    distance = distance.reshape(-1, elevation.size).T
+    azimuth = (survey.azimuth[:: elevation.size] + 180.0) % 360.0 - 180.0
     # Beyond the tree there is ground alone.
     image = view.pcolormesh(azimuth, elevation, distance, cmap="viridis_r", vmax=REACH, rasterized=True)
     figure.colorbar(image, ax=view, label="range of the first return (m)", extend="max")

@@ -20,8 +20,8 @@ waveforms is in the package `inversion`.
 
 ## Surveys of many shots
 
-`Survey`, `Trajectory`, `AbstractScan`, `Oscillating`, `RotatingPolygon`, `Conical`, `ground_position`,
-`simulate_many`, `simulate_tiles`, `Waveforms`, `SceneParts`, `DiscreteReturns`.
+`Survey`, `Trajectory`, `AbstractScan`, `Oscillating`, `RotatingPolygon`, `Conical`, `Panorama`, `Risley`,
+`ground_position`, `simulate_many`, `simulate_tiles`, `Waveforms`, `SceneParts`, `DiscreteReturns`.
 
 ## Many scenes
 
@@ -130,7 +130,7 @@ from jaxlidar.sensors.pulse import (
     SampledPulse,
 )
 from jaxlidar.sensors.receiver import Receiver, first_return_window, record
-from jaxlidar.sensors.scan import AbstractScan, Conical, Oscillating, RotatingPolygon
+from jaxlidar.sensors.scan import AbstractScan, Conical, Oscillating, Panorama, Risley, RotatingPolygon
 from jaxlidar.sensors.survey import Survey
 from jaxlidar.sensors.trajectory import Trajectory
 from jaxlidar.simulation.energy import energy_budget
@@ -179,6 +179,8 @@ __all__ = [
     "Oscillating",
     "RotatingPolygon",
     "Conical",
+    "Panorama",
+    "Risley",
     "ground_position",
     "simulate_many",
     "simulate_tiles",

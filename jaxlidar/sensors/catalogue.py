@@ -33,14 +33,14 @@ from jaxlidar.sensors.pulse import (
     SampledPulse,
 )
 from jaxlidar.sensors.receiver import Receiver
-from jaxlidar.sensors.scan import Conical, Oscillating, RotatingPolygon
+from jaxlidar.sensors.scan import Conical, Oscillating, Panorama, Risley, RotatingPolygon
 
 # Classes of tables that have a `kind`.
 _CLASSES: dict[str, Callable[..., Any]] = {
     kind.__name__: kind
     for kind in (
         *(GaussianPulse, ExponentiallyModifiedGaussianPulse, RectangularPulse, SampledPulse),
-        *(Conical, Oscillating, RotatingPolygon),
+        *(Conical, Oscillating, RotatingPolygon, Panorama, Risley),
         *(Receiver, PhotonCounter),
     )
 }

@@ -56,12 +56,10 @@ from jaxlidar._text import object_text
 from jaxlidar.sensors.photon_counter import PhotonCounter
 from jaxlidar.sensors.pulse import AbstractPulse, GaussianPulse
 from jaxlidar.sensors.receiver import Receiver
-from jaxlidar.sensors.scan import AbstractScan
+from jaxlidar.sensors.scan import MAX_ZENITH, STRAIGHT_UP, AbstractScan
 
 # Distance, m, from a sensor that is given by its position to its aim point, the origin of traced coordinates.
 AIM_DISTANCE = 1.0
-# Largest zenith angle, degrees, of a beam that is to meet the reference plane, and of any beam.
-_MAX_ZENITH, STRAIGHT_UP = 89.0, 180.0
 # Largest divergence, mrad: beyond, a beam's irradiance is no longer that of a disc across its axis.
 _MAX_DIVERGENCE = 300.0
 
@@ -351,7 +349,7 @@ class Lidar(eqx.Module):
     @property
     def ranges(self) -> dict[str, Range]:
         """Admissible range of the zenith. A beam that is to meet the reference plane must go down."""
-        return {} if self.has_sensor_position else {"zenith": Range(0.0, _MAX_ZENITH, mirrored=True)}
+        return {} if self.has_sensor_position else {"zenith": Range(0.0, MAX_ZENITH, mirrored=True)}
 
     @property
     def range_to_reference(self) -> Float[Array, ""]:

@@ -35,14 +35,15 @@ from jaxlidar._fields.checks import (
     check_shape,
     concrete_array,
     concrete_number,
+    kind_of,
     warn_unit,
 )
 from jaxlidar._fields.crs import common_system, crs_name
 from jaxlidar._jax.memory import format_bytes, machine_memory
 from jaxlidar._registry import shots_within
 from jaxlidar._text import number_text
-from jaxlidar.sensors.lidar import AIM_DISTANCE, STRAIGHT_UP, Lidar
-from jaxlidar.sensors.scan import MAX_ZENITH, AbstractScan
+from jaxlidar.sensors.lidar import AIM_DISTANCE, Lidar
+from jaxlidar.sensors.scan import MAX_ZENITH, STRAIGHT_UP, AbstractScan, Panorama
 from jaxlidar.sensors.trajectory import Trajectory, body_rotation, rotation_matrix, three_numbers
 
 # A length that falls short of a multiple of the spacing by this fraction, as by rounding, counts as the
@@ -550,10 +551,10 @@ class Survey(eqx.Module):
     def scan(
         lidar: Lidar,
         pattern: AbstractScan,
-        start: Numbers,
-        end: Numbers,
-        speed: SupportsFloat,
-        pulse_rate: SupportsFloat,
+        start: Numbers | None = None,
+        end: Numbers | None = None,
+        speed: SupportsFloat | None = None,
+        pulse_rate: SupportsFloat | None = None,
         *,
         gps_time: SupportsFloat = 0.0,
         flight_line: int = 1,
@@ -561,7 +562,8 @@ class Survey(eqx.Module):
         """Make a survey of the shots of a scanner on a level platform that flies along a line.
 
         The platform flies at the lidar's altitude above the reference plane. Zenith, azimuth and scan angle
-        (across the track, positive to the right) follow from the pattern.
+        (across the track, positive to the right) follow from the pattern. A lidar that is placed by its
+        sensor stands there, as on a tripod that looks north, and scans a `Panorama`.
 
         **Arguments:**
 
@@ -569,7 +571,7 @@ class Survey(eqx.Module):
         - `pattern`: an `Oscillating`, a `RotatingPolygon`, a `Conical`, or another `AbstractScan`.
         - `start`, `end`: (x, y) in m of the platform at the first shot and at the end of the line.
         - `speed`: of the platform in m/s, positive.
-        - `pulse_rate`: shots per s, positive.
+        - `pulse_rate`: shots per s, positive. A scanner that stands still takes none of these four.
         - `gps_time`: GPS time of the first shot in s, as that of `Survey`. Default 0.
         - `flight_line`: number of the flight line. Default 1.
 
@@ -586,18 +588,30 @@ class Survey(eqx.Module):
         >>> survey = jl.Survey.scan(jl.Lidar(), jl.Conical(half_angle=20.0, frequency=40.0), **line)
         >>> print(len(survey), survey.zenith[:2].round(3).tolist())
         2001 [20.0, 20.0]
+        >>> tripod = jl.Lidar(sensor=(0.0, 0.0, 1.7))
+        >>> len(jl.Survey.scan(tripod, jl.Panorama(zenith=(30.0, 150.0), step=10.0)))
+        468
         """
         check_kind(
             "pattern", pattern, AbstractScan, "a scan pattern, as in Conical(half_angle=20, frequency=40)"
         )
         check_kind("lidar", lidar, Lidar, "a Lidar, as in Survey.scan(Lidar(), ...)")
+        check_number("gps_time", gps_time)
+        flown = {"start": start, "end": end, "speed": speed, "pulse_rate": pulse_rate}
         if lidar.altitude is None:
-            raise ValueError("lidar is placed by its sensor; admissible is an altitude, or Survey.fly")
+            return _station(lidar, pattern, flown, float(gps_time), flight_line)
+        for field, value in flown.items():
+            if value is None:
+                raise ValueError(
+                    f"{field} is None; admissible is that of a line, or a lidar that stands still, "
+                    "lidar.at(...)"
+                )
         first, forward, _, length = _line(start, end)
         check_number("speed", speed, 0.0, low_open=True)
         check_number("pulse_rate", pulse_rate, 0.0, low_open=True)
         warn_unit("pulse_rate", pulse_rate, _PULSE_RATE)
-        check_number("gps_time", gps_time)
+        assert speed is not None
+        assert pulse_rate is not None
         shots = _count_along(length, float(speed) / float(pulse_rate))
         rate = f"pulse_rate = {float(pulse_rate):g} at speed = {float(speed):g}"
         _check_number_of_shots(rate, shots)
@@ -705,6 +719,29 @@ def _lifted(flight: Trajectory, terrain: Any) -> Trajectory:
     ground = np.asarray(terrain.height_at(flight.position[:, 0], flight.position[:, 1]), float)
     lifted = flight.position + np.pad(ground[:, None], ((0, 0), (2, 0)))
     return dataclasses.replace(flight, position=lifted, crs=crs)
+
+
+def _station(
+    lidar: Lidar, pattern: AbstractScan, flown: dict[str, Any], gps_time: float, flight_line: int
+) -> Survey:
+    """Return the survey of a scanner that stands at the lidar's sensor, level, and looks north."""
+    for field, value in flown.items():
+        if value is not None:
+            raise ValueError(
+                f"{field} is given, but lidar is placed by its sensor and stands still; admissible is an "
+                "altitude, or Survey.fly"
+            )
+    if not isinstance(pattern, Panorama):
+        raise ValueError(
+            f"pattern is {kind_of(pattern)}, but lidar is placed by its sensor and stands still; admissible "
+            "is a Panorama, or Survey.fly with a trajectory of two times in one place"
+        )
+    lines, shots = pattern.shape
+    _check_number_of_shots(f"step = {pattern.step}", lines * shots)
+    time = pattern.time
+    place = np.broadcast_to(concrete_array(lidar.position), (time.size, 3))
+    survey = _strip(lidar, Trajectory(time, place, yaw=0.0), pattern, flight_line)
+    return eqx.tree_at(lambda s: s.gps_time, survey, gps_time + time)
 
 
 def _strip(

@@ -149,7 +149,7 @@ def test_every_class_has_an_example():
     # No lidar, survey or scene holds one of these: they make trees, surveys and the shapes of surfaces.
     plants, scan_patterns = (
         {"Habit", "Branching", "Stand"},
-        {"Oscillating", "RotatingPolygon", "Conical", "Trajectory"},
+        {"Oscillating", "RotatingPolygon", "Conical", "Panorama", "Risley", "Trajectory"},
     )
     # Their arrays of whole numbers have tests of their own, in tests/scenes/test_mesh_surface.py.
     meshes = {"Mesh", "MeshSurface", "MeshInstances"}

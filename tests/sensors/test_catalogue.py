@@ -1,5 +1,7 @@
 """Instruments by name: all are lidars whose numbers have a source, and ATLAS counts what is published."""
 
+import dataclasses
+
 import jax
 import numpy as np
 import pytest
@@ -35,6 +37,10 @@ def test_the_table_has_the_instruments_that_it_should():
     for name in ("GEDI power", "GEDI coverage", "ATLAS strong", "ATLAS weak"):
         assert {name, f"{name} day"} <= set(names)
     assert "LVIS" in names
+    terrestrial = {"RIEGL VZ-400", "RIEGL VZ-400i", "RIEGL VZ-600i", "Leica RTC360", "Z+F IMAGER 5016"}
+    assert terrestrial <= {n for n in names if isinstance(jl.instrument(n).scan, jl.Panorama)}
+    assert isinstance(jl.instrument("Livox Avia").scan, jl.Risley)
+    assert jl.instrument("Livox Mid-360").scan is None
     for beam in ("GEDI power", "GEDI coverage"):
         assert float(jl.instrument(f"{beam} day").receiver.background) > 0
         assert float(jl.instrument(beam).receiver.background) == 0
@@ -61,7 +67,10 @@ def test_scan_patterns_make_surveys_and_leave_the_compiled_program_alone():
     line = {"start": (0, 0), "end": (0, 1), "speed": 60.0, "pulse_rate": 1000.0}
     for name in jl.instruments():
         lidar = jl.instrument(name)
-        if lidar.scan is not None:
+        if isinstance(lidar.scan, jl.Panorama):
+            pattern = dataclasses.replace(lidar.scan, step=5.0)
+            assert len(jl.Survey.scan(lidar.at((0, 0, 1.5)), pattern)) > 1000
+        elif lidar.scan is not None:
             assert len(jl.Survey.scan(lidar, lidar.scan, **line)) > 10
     lidar = jl.instrument("RIEGL VQ-780 II")
     scene = jl.Scene(ground=jl.Ground())
@@ -126,7 +135,7 @@ def test_cases_name_instruments_and_hold_scans_and_counters(tmp_path):
     path.write_text('[lidar]\nkind = "instrument"\nname = "ATLAS weak"\n')
     lidar = jl.io.read_case(path).lidar
     assert isinstance(lidar.receiver, jl.PhotonCounter)
-    for name in ("ATLAS weak", "Leica TerrainMapper"):
+    for name in ("ATLAS weak", "Leica TerrainMapper", "RIEGL VZ-400", "Livox Avia"):
         lidar = jl.instrument(name)
         jl.io.write_case(path, jl.io.Case(lidar=lidar))
         read_lidar = jl.io.read_case(path).lidar
