@@ -94,7 +94,8 @@ def leaf_mesh(
       the stand; without one `leaf_area`, a leaf for each clump.
 
     **Returns:** a `MeshSurface` of the material "leaf", two-sided; of a stand a tuple of them, one or more of
-    each individual, for `Scene(meshes=)`.
+    each individual, for `Scene(meshes=)`. Its copies are numbered as the trees of the stand, from 1, for
+    `DiscreteReturns.labelled`.
 
     **Raises:** ValueError for numbers outside their ranges, an unknown shape or name of a distribution, a
     canopy without leaf, `clump_leaf_area` for voxels, and more leaves than memory holds, with their number;
@@ -144,11 +145,15 @@ def leaf_mesh(
 
 
 class _Leaves(NamedTuple):
-    """Leaves of one mesh: their centres, m, the one-sided area of each, m2, and the places of its copies."""
+    """Leaves of one mesh: their centres, m, the one-sided area of each, m2, and the places of its copies.
+
+    `instance`: number of the tree of each leaf, where the mesh is that of several trees.
+    """
 
     centre: Float[np.ndarray, "leaves 3"]
     leaf_area: float
     instances: MeshInstances | None = None
+    instance: Int[np.ndarray, " leaves"] | None = None
 
 
 def _optics(leaf: Any) -> tuple[Any, Any]:
@@ -230,13 +235,14 @@ def _in_stand(
         tree = tree.scaled((1.0, float(vertical[first] / horizontal[first]), 1.0))
         leaf = leaf_area / float(np.mean(h**2))
         counts = _counts(np.full(n_clumps[first], area[first] / h[0] ** 2), leaf, shape, random)
-        places = MeshInstances(stand.position[copies], stand.azimuth[copies], h)
+        places = MeshInstances(stand.position[copies], stand.azimuth[copies], h, copies + 1)
         meshes.append(_Leaves(points_in_clumps(tree, counts, random), leaf, places))
     single = leafy[count[kind] == 1]
     if len(single):
         trees = Tree.joined(stand[int(i)] for i in single)
         counts = _counts(np.repeat(area[single], n_clumps[single]), leaf_area, shape, random)
-        meshes.append(_Leaves(points_in_clumps(trees, counts, random), leaf_area))
+        number = np.repeat(np.repeat(single + 1, n_clumps[single]), counts)
+        meshes.append(_Leaves(points_in_clumps(trees, counts, random), leaf_area, instance=number))
     return meshes
 
 
@@ -264,6 +270,7 @@ def _surface(
     corners = leaf_corners(leaves.centre, along, across, leaves.leaf_area, shape)
     n_corners = corners.shape[1]
     faces = np.arange(n)[:, None, None] * n_corners + leaf_faces(n_corners)
-    mesh = Mesh(corners.reshape(-1, 3), faces.reshape(-1, 3), materials=("leaf",))
+    instance = None if leaves.instance is None else np.repeat(leaves.instance, faces.shape[1])
+    mesh = Mesh(corners.reshape(-1, 3), faces.reshape(-1, 3), materials=("leaf",), instance=instance)
     reflectance, transmittance = ({"leaf": a} for a in optics)
     return MeshSurface(mesh, reflectance, transmittance, instances=leaves.instances, crs=crs)

@@ -33,6 +33,7 @@ from jaxlidar._text import percent
 from jaxlidar.optics.leaf_angles import ANGLE_CELLS, LeafAngles
 from jaxlidar.plants.grid import Grid, voxel_edges
 from jaxlidar.plants.tree import Tree
+from jaxlidar.scenes.mesh_surface import instance_numbers
 from jaxlidar.scenes.voxels import VoxelMap
 
 # Outlines of leaves: regular polygons, by the number of their corners and their width over their length.
@@ -61,6 +62,8 @@ class Mesh:
     - `faces`: (n, 3) indices of the corners of each triangle, whole numbers from 0.
     - `material`: (n,) for each triangle the index of its material. Default None: the first.
     - `materials`: names of the materials, each its own. Default ("mesh",).
+    - `instance`: (n,) for each triangle the number of the tree or object that it belongs to, an integer, 0 or
+      more, by which `DiscreteReturns.labelled` labels what hits it. Default None: not stated.
 
     **Raises:** ValueError for arrays of other shapes, no triangle, positions that are not finite, indices of
     vertices and materials that do not exist, and a name that occurs twice; TypeError for indices that are no
@@ -78,6 +81,7 @@ class Mesh:
     faces: Int[np.ndarray, "n 3"]
     material: Int[np.ndarray, " n"]
     materials: tuple[str, ...]
+    instance: Int[np.ndarray, " n"] | None
 
     def __init__(
         self,
@@ -85,6 +89,7 @@ class Mesh:
         faces: ArrayLike | Sequence,
         material: ArrayLike | Sequence | None = None,
         materials: Sequence[str] = ("mesh",),
+        instance: ArrayLike | Sequence | None = None,
     ):
         check_range("vertices", vertices)
         vertices, faces = np.asarray(vertices, float), np.asarray(faces)
@@ -105,6 +110,7 @@ class Mesh:
             raise ValueError(f"materials = {names} has a name twice")
         check_range("material", material, 0, len(names) - 1)
         fields = {"vertices": vertices, "faces": faces, "material": material, "materials": names}
+        fields["instance"] = instance_numbers(instance, len(faces))
         for name, value in fields.items():
             object.__setattr__(self, name, value)
 

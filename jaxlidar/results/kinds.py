@@ -201,9 +201,11 @@ def argument_value(value: Any, name: str, argument: Argument) -> Any:
 
 def _mesh_of_surface(surface: MeshSurface) -> Mesh:
     """Return the mesh of a surface, without the triangles that fill up its tree."""
-    rows = np.unique(np.column_stack([surface.faces, surface.group]), axis=0)
+    stated = () if surface.instance is None else (surface.instance,)
+    rows = np.unique(np.column_stack([surface.faces, surface.group, *stated]), axis=0)
     vertices = concrete_array(surface.vertices) + surface.origin
-    return Mesh(vertices, rows[:, :3], rows[:, 3], surface.materials or ("mesh",))
+    instance = rows[:, 4] if stated else None
+    return Mesh(vertices, rows[:, :3], rows[:, 3], surface.materials or ("mesh",), instance)
 
 
 def call_kind(kind: Callable[..., Any], arguments: Mapping[str, Any], annotation: Any = Any) -> Any:

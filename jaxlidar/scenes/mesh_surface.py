@@ -59,6 +59,8 @@ from jaxlidar.scenes.triangle_tree import (
 
 # Rows of the table, twice as many as triangles, are numbered by integers of 32 bits.
 MAX_TRIANGLES = 1 << 28
+# Largest number of an instance: integers up to it are floats of single precision, as in extra bytes of LAS.
+_MAX_INSTANCE = 1 << 24
 # Slack of the boxes of instances, in units of the floating-point precision and of their coordinates: rays are
 # transformed to coordinates of the mesh with rounding.
 _INSTANCE_ROUNDING = 16.0
@@ -84,6 +86,18 @@ def _coordinates(field: str, x: Any, columns: int) -> Array | np.ndarray:
     return rows
 
 
+def instance_numbers(x: Any, count: int) -> Int[np.ndarray, " n"] | None:
+    """Convert the numbers of copies, or those of triangles; None stays None."""
+    if x is None:
+        return None
+    numbers = np.asarray(x)
+    if numbers.dtype.kind not in "iu":
+        raise TypeError(f"instance is an array of {numbers.dtype}; admissible are integers")
+    check_shape("instance", numbers, (count,))
+    check_range("instance", numbers, 0, _MAX_INSTANCE)
+    return numbers.astype(np.int32)
+
+
 @final
 class MeshInstances(eqx.Module):
     """Places of copies of a mesh: each is scaled and rotated about the mesh's own origin, then shifted.
@@ -98,9 +112,11 @@ class MeshInstances(eqx.Module):
       vectors: the direction is the axis, the length the angle in degrees, anticlockwise as seen against the
       axis. Default None: not rotated.
     - `scale`: (n,) factors of all lengths, positive. Default None: 1.
+    - `instance`: (n,) number of each copy, such as that of its tree, by which `DiscreteReturns.labelled`
+      labels what hits it: integers, 0 or more. Default None: those of the triangles, or none stated.
 
-    **Raises:** ValueError for arrays of other shapes, a scale that is not positive, and values that are not
-    finite.
+    **Raises:** ValueError for arrays of other shapes, a scale that is not positive, a negative number of a
+    copy, and values that are not finite; TypeError for numbers of copies that are no integers.
 
     **Example:** two copies, the second turned by a quarter and twice as large.
 
@@ -113,9 +129,14 @@ class MeshInstances(eqx.Module):
     shift: Float[Array | np.ndarray, "n 3"] = quantity(unit="m")
     rotation: Float[Array, "n 3"] = quantity(unit=DEGREES)
     scale: Float[Array, " n"] = quantity(range=POSITIVE)
+    instance: Int[np.ndarray, " n"] | None
 
     def __init__(
-        self, shift: ArrayLike | Sequence, rotation: ArrayLike | Sequence | None = None, scale: Any = None
+        self,
+        shift: ArrayLike | Sequence,
+        rotation: ArrayLike | Sequence | None = None,
+        scale: Any = None,
+        instance: Int[ArrayLike, " n"] | Sequence | None = None,
     ):
         self.shift = _coordinates("shift", shift, 3)
         count = len(self.shift)
@@ -127,6 +148,7 @@ class MeshInstances(eqx.Module):
         self.rotation = rotation
         self.scale = as_array(np.ones(count) if scale is None else scale, "scale")
         check_shape("scale", self.scale, (count,))
+        self.instance = instance_numbers(instance, count)
 
     def __check_init__(self):
         check_ranges(self)
@@ -210,6 +232,7 @@ class MeshSurface(eqx.Module):
     vertices: Float[Array, "m 3"]
     faces: Int[np.ndarray, "leaves 3"]
     group: Int[np.ndarray, " leaves"]
+    instance: Int[np.ndarray, " leaves"] | None
     origin: Float[np.ndarray, "3"]
     reflectance: Any | Mapping[str, Any]
     transmittance: Any | Mapping[str, Any]
@@ -235,7 +258,7 @@ class MeshSurface(eqx.Module):
         crs: str | int | None = None,
     ):
         self.crs = crs_name(crs)
-        vertices, faces, group, names = _mesh_arrays(mesh)
+        vertices, faces, group, names, instance = _mesh_arrays(mesh)
         check_kind("law", law, AbstractLaw, "a law of reflection, such as Lambertian()")
         if isinstance(law, AbstractMirror):
             raise ValueError(
@@ -261,6 +284,7 @@ class MeshSurface(eqx.Module):
         self.faces = faces[order].astype(np.int32)
         numbers = np.searchsorted(np.unique(group), group) if by_material else np.zeros(len(faces), int)
         self.group = numbers[order].astype(np.int32)
+        self.instance = None if instance is None else instance[order]
         self.instances = MeshInstances(np.zeros((1, 3))) if instances is None else instances
         known_scale = concrete(self.instances.scale)
         scale = 1.0 if known_scale is None else float(known_scale.max())
@@ -369,9 +393,9 @@ class MeshSurface(eqx.Module):
 
 def _mesh_arrays(
     mesh: Any,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, tuple[str, ...]]:
-    """Return vertices, faces, the group of each face, and the names of groups, of any kind of mesh."""
-    group, names = None, ("mesh",)
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, tuple[str, ...], np.ndarray | None]:
+    """Return vertices, faces, the group of each face, names of groups, and instances, of any kind of mesh."""
+    group, names, instance = None, ("mesh",), None
     if isinstance(mesh, tuple | list) and len(mesh) == 2:
         vertices, faces = mesh
     elif not isinstance(mesh, tuple | list) and hasattr(mesh, "vertices") and hasattr(mesh, "faces"):
@@ -382,7 +406,7 @@ def _mesh_arrays(
         vertices, faces = mesh.vertices, mesh.faces
         if hasattr(mesh, "materials") and hasattr(mesh, "material"):
             # A `Mesh`, whose package stands above this one.
-            group, names = mesh.material, tuple(mesh.materials)
+            group, names, instance = mesh.material, tuple(mesh.materials), mesh.instance
     else:
         raise TypeError(
             f"mesh is {kind_of(mesh)}; admissible is a Mesh, a trimesh.Trimesh, or a tuple (vertices, faces)"
@@ -408,7 +432,8 @@ def _mesh_arrays(
     has_area = np.any(np.cross(second - first, third - first) != 0.0, axis=1)
     if not has_area.any():
         raise ValueError("mesh has no triangle with an area; admissible is one or more")
-    return vertices, faces[has_area], group[has_area], names
+    instance = None if instance is None else instance[has_area]
+    return vertices, faces[has_area], group[has_area], names, instance
 
 
 def _check_origin(vertices: Float[np.ndarray, "m 3"], instances: MeshInstances) -> None:
@@ -516,12 +541,14 @@ class MeshTree(eqx.Module):
 
     - `tree`: the tree, relative to `offset`, m. - `material`: that of the triangle in each row of the table;
       None where all have one material. - `longest_side`: of all triangles, m.
+    - `copy`: number of the copy in each leaf of the upper tree, those of all meshes in order.
     """
 
     tree: TriangleTree
     offset: Float[Array, "3"]
     material: Int[Array, "rows"] | None
     longest_side: Float[Array, ""]
+    copy: Int[Array, "leaves"]
 
     def moved(self, by: Float[Array, "3"]) -> "MeshTree":
         """Move all meshes."""
@@ -529,11 +556,15 @@ class MeshTree(eqx.Module):
 
     def meet(self, x: Vec, w: Vec) -> MeshHit:
         """Find the triangles that rays meet first."""
+        return self.meet_row(x, w)[0]
+
+    def meet_row(self, x: Vec, w: Vec) -> tuple[MeshHit, Int[Array, "*s"], Int[Array, "*s"]]:
+        """Find the triangles that rays meet first, their rows in the table, and the numbers of the copies."""
         x = vec(a - b for a, b in zip(x, self.offset))
         hit = nearest_triangle(self.tree, x, w)
         distance, normal = triangle_plane(self.tree, hit, x, w)
         material = jnp.zeros_like(hit.row) if self.material is None else self.material[hit.row]
-        return MeshHit(distance, normal, material)
+        return MeshHit(distance, normal, material), hit.row, self.copy[hit.leaf]
 
     def is_met(self, x: Vec, w: Vec, active: Any = None, before: Scalar | None = None) -> Array:
         """Return True for rays that meet any triangle; with `before`, within this distance, m."""
@@ -615,11 +646,13 @@ def build_mesh_tree(meshes: Sequence[MeshSurface], period: Float[Array, "2"] | N
     uniform = numbers[0] if len(set(numbers)) == 1 else None
     rows = jnp.concatenate([upper, *lower])
     tree = TriangleTree(rows, instances, box, uniform, period, several_materials=first_material > 1)
+    copy = fill(jnp.arange(n_instances, dtype=jnp.int32) % (n_instances // n_copies), 0)[order]
     return MeshTree(
         tree,
         jnp.zeros_like(shift[0]),
         jnp.concatenate(materials) if first_material > 1 else None,
         lax.stop_gradient(jnp.max(jnp.stack(longest_sides))),
+        copy,
     )
 
 

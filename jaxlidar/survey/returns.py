@@ -53,6 +53,7 @@ from jaxlidar._constants import SPEED_OF_LIGHT
 from jaxlidar._fields.checks import (
     as_numpy,
     check_choice,
+    check_flag,
     check_integer,
     check_kind,
     check_number,
@@ -66,9 +67,11 @@ from jaxlidar.formats.airborne import AirborneShot, Returns, Segment
 from jaxlidar.formats.las import LasWriter, write_las
 from jaxlidar.planning.channels import unnumbered
 from jaxlidar.progress import Progress, ProgressOption
+from jaxlidar.scenes.scene import Scene
 from jaxlidar.sensors.lidar import Lidar
 from jaxlidar.sensors.survey import Survey, beam_directions
 from jaxlidar.survey.acquisition import PULSE_OVERSAMPLING, Acquisition, acquisition_of
+from jaxlidar.survey.labels import labels_of
 
 DETECTORS = ("peak", "constant fraction", "leading edge", "decomposition")
 # A function of the times, samples and noise of one record, (samples,) each, which gives times of returns.
@@ -111,6 +114,8 @@ _FULL_INTENSITY = 65535
 _ORDERS = ("first", "higher")
 # Materials of plants: of voxels, and of the triangles of `leaf_mesh` and `mesh_of`.
 _PLANTS = ("leaf", "bark", "mesh:leaf", "mesh:wood")
+# Materials of the parts of `DiscreteReturns.part`, by its numbers.
+_PARTS = (("air", _NO_MATERIAL), ("ground",), ("leaf", "mesh:leaf"), ("bark", "mesh:wood"))
 
 
 @final
@@ -131,6 +136,9 @@ class DiscreteReturns(eqx.Module):
       none.
     - `gps_time`: (returns,) s, NaN if unknown; `scan_angle`: (returns,) degrees; `flight_line`: (returns,).
     - `crs`: coordinate reference system of the survey and its scene; None if unknown.
+    - `instance`: (returns,) number of the tree or copy that was hit, 0 for none; `normal`: (returns, 3) unit
+      vectors of the surface that was hit, on the side of the sensor; `incidence`: (returns,) degrees between
+      the beam and that normal; NaN for none. None unless `labelled` has found them.
 
     Material and ground share are from the simulation; instruments do not record them.
 
@@ -164,6 +172,9 @@ class DiscreteReturns(eqx.Module):
     flight_line: Int[np.ndarray, " returns"]
     n_shots: int = eqx.field(static=True)
     crs: str | None = eqx.field(static=True, default=None)
+    instance: Int[np.ndarray, " returns"] | None = None
+    normal: Float[np.ndarray, "returns 3"] | None = None
+    incidence: Float[np.ndarray, " returns"] | None = None
 
     def __len__(self) -> int:
         return len(self.shot)
@@ -194,17 +205,72 @@ class DiscreteReturns(eqx.Module):
         return classes
 
     @property
+    def part(self) -> Int[np.ndarray, " returns"]:
+        """Parts of the scene, (returns,): 1 ground, 2 leaf, 3 wood, 4 other surfaces, 0 air and noise."""
+        names = np.array([unnumbered(name) for name in self.material.tolist()], object)
+        parts = np.full(len(self), 4)
+        for number, of_part in enumerate(_PARTS):
+            parts[np.isin(names, of_part)] = number
+        return parts
+
+    def labelled(self, survey: Survey, scene: Scene) -> "DiscreteReturns":
+        """Find what was hit: the tree or copy, the normal of its surface, and the incidence angle.
+
+        Training data for segmentation need these. Rays over the footprint of each shot are followed to what
+        they meet first; a return has the labels of most of those that come to its range. Returns of the
+        voxels of a canopy, which have no surface, have the instance 0 and no normal: `leaf_mesh` makes leaves
+        that have both.
+
+        Instances are those that `MeshInstances`, or else the `Mesh`, states; `leaf_mesh` of a `Stand` numbers
+        its trees from 1. Where no mesh of the scene states any, copies are numbered from 1, mesh after mesh.
+
+        **Arguments:** `survey`, `scene`: those that were simulated.
+
+        **Returns:** a `DiscreteReturns` with `instance`, `normal` and `incidence`.
+
+        **Raises:** ValueError for another number of shots than that of the returns; TypeError for objects of
+        the wrong type, such as `SceneParts`.
+
+        **Example:** a roof that falls to the east at 30 degrees.
+
+        >>> import jax, jaxlidar as jl
+        >>> corners = [(-3, -3, 4), (3, -3, 4 - 6 * 3**-0.5), (3, 3, 4 - 6 * 3**-0.5), (-3, 3, 4)]
+        >>> roof = jl.MeshSurface((corners, [(0, 1, 2), (0, 2, 3)]), reflectance=0.3)
+        >>> scene = jl.Scene(meshes=[roof], ground=jl.Ground(reflectance=0.3))
+        >>> survey = jl.Survey.grid(jl.Lidar(altitude=300.0), low=(0, 0), high=(10, 0), spacing=10.0)
+        >>> returns = jl.simulate_many(survey, scene, key=jax.random.key(0)).returns()
+        >>> returns = returns.labelled(survey, scene)
+        >>> print(returns.material, returns.instance, returns.incidence.round(1))
+        ['mesh' 'ground'] [1 0] [30.  0.]
+        """
+        check_kind("survey", survey, Survey, "the Survey that was simulated")
+        check_kind("scene", scene, Scene, "the Scene that was simulated")
+        if len(survey) != self.n_shots:
+            raise ValueError(
+                f"survey has {len(survey)} shots; admissible is that of the returns, {self.n_shots}"
+            )
+        # Ranges of a survey that is disturbed are stated with their error.
+        error = np.zeros(self.n_shots) if survey.stated is None else survey.stated[:, 5]
+        true_range = self.range - error[self.shot]
+        labels = labels_of(self.shot, true_range, self.width, self.material, survey, scene)
+        return dataclasses.replace(self, **labels._asdict())
+
+    @property
     def intensity(self) -> Int[np.ndarray, " returns"]:
         """Apparent reflectance in whole steps, (returns,): 65535 is one, or the largest above one."""
         largest = max(1.0, float(np.max(self.reflectance, initial=0.0)))
         return np.round(np.maximum(self.reflectance, 0.0) * (_FULL_INTENSITY / largest)).astype(int)
 
-    def to_las(self, path: str | os.PathLike[str] | LasWriter, *, crs: str | None = None) -> None:
+    def to_las(
+        self, path: str | os.PathLike[str] | LasWriter, *, crs: str | None = None, extra: bool = True
+    ) -> None:
         """Write the returns as a LAS or LAZ file: version 1.4, point format 6.
 
         Points have return numbers, `classification`, `intensity`, GPS time (0 if unknown), scan angle, the
         flight line as point source, and as extra bytes "width" (ns), "reflectance", "amplitude" (J) and
-        "ground share". `jaxlidar.io.read_las` drops points of noise (classes 7 and 18).
+        "ground share"; where `labelled` has found them also "part", "instance", "incidence" (degrees) and
+        "normal x", "normal y", "normal z" (0 for none). `jaxlidar.io.read_las` drops points of noise (classes
+        7 and 18).
 
         **Arguments:**
 
@@ -213,6 +279,7 @@ class DiscreteReturns(eqx.Module):
           65535 is a reflectance of one, and larger ones are refused.
         - `crs`: coordinate reference system of the scene, in metres, such as "EPSG:32633". Default None: that
           of the returns, or of the `LasWriter`. This needs pyproj.
+        - `extra`: False for a file without extra bytes, as some readers need. Default True.
 
         **Raises:** as `jaxlidar.io.write_las`; ValueError for another system than that of the returns, where
         there is no return, and for more than 15 of one shot (`max_returns` of `Waveforms.returns`).
@@ -229,12 +296,13 @@ class DiscreteReturns(eqx.Module):
         >>> print(cloud.position[:, 2].round(2), cloud.classification)
         [2.5 2.5] [2 2]
         """
+        check_flag("extra", extra)
         if isinstance(path, LasWriter):
             if crs is not None:
                 raise ValueError(f"crs = {crs!r} is given together with a LasWriter, which has its own")
             if len(self):
                 intensity = _FULL_INTENSITY * np.maximum(self.reflectance, 0.0)
-                path.write(self.position, **self._point_fields(intensity), crs=self.crs)
+                path.write(self.position, **self._point_fields(intensity, extra), crs=self.crs)
             return
         if len(self) == 0:
             raise ValueError(
@@ -243,9 +311,9 @@ class DiscreteReturns(eqx.Module):
                 "true_returns), or write the waveforms with to_las_waveforms"
             )
         crs = common_system({"the simulation": self.crs, "crs": crs})
-        write_las(path, self.position, crs=crs, **self._point_fields(self.intensity))
+        write_las(path, self.position, crs=crs, **self._point_fields(self.intensity, extra))
 
-    def _point_fields(self, intensity: Num[np.ndarray, " returns"]) -> dict[str, Any]:
+    def _point_fields(self, intensity: Num[np.ndarray, " returns"], extra: bool) -> dict[str, Any]:
         """Return the arguments of `write_las` beside positions."""
         return {
             "intensity": intensity,
@@ -255,13 +323,25 @@ class DiscreteReturns(eqx.Module):
             "classification": self.classification,
             "scan_angle": self.scan_angle,
             "point_source": self.flight_line,
-            "extra": {
-                "width": ("full width at half maximum, ns", self.width),
-                "reflectance": ("apparent reflectance", self.reflectance),
-                "amplitude": ("peak energy per sample, J", self.amplitude),
-                "ground share": ("fraction scattered by ground", self.ground_share),
-            },
+            "extra": self._extra_numbers() if extra else {},
         }
+
+    def _extra_numbers(self) -> dict[str, tuple[str, Num[np.ndarray, " returns"]]]:
+        """Return what goes into extra bytes, by name: a description, and the numbers."""
+        numbers = {
+            "width": ("full width at half maximum, ns", self.width),
+            "reflectance": ("apparent reflectance", self.reflectance),
+            "amplitude": ("peak energy per sample, J", self.amplitude),
+            "ground share": ("fraction scattered by ground", self.ground_share),
+        }
+        if self.instance is None or self.normal is None or self.incidence is None:
+            return numbers
+        numbers["part"] = ("1 ground 2 leaf 3 wood 4 other", self.part)
+        numbers["instance"] = ("number of the tree, 0 for none", self.instance)
+        numbers["incidence"] = ("from the normal, degrees", np.nan_to_num(self.incidence))
+        for axis, values in zip("xyz", np.nan_to_num(self.normal).T):
+            numbers[f"normal {axis}"] = ("of the surface that was hit", values)
+        return numbers
 
 
 # -- geometry ----------------------------------------------------------------------------------------------

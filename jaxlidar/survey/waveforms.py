@@ -346,6 +346,7 @@ class Waveforms(eqx.Module):
         path: str | os.PathLike[str] | LasWriter,
         *,
         crs: str | None = None,
+        extra: bool = True,
         detector: str | DetectorFunction = "peak",
         **options: Any,
     ) -> DiscreteReturns:
@@ -353,7 +354,7 @@ class Waveforms(eqx.Module):
 
         **Arguments:**
 
-        - `path`, `crs`: those of `DiscreteReturns.to_las`.
+        - `path`, `crs`, `extra`: those of `DiscreteReturns.to_las`.
         - `detector`, `options`: those of `returns`; `max_returns` is 15 by default, as many as the format
           holds.
 
@@ -372,7 +373,7 @@ class Waveforms(eqx.Module):
         2 returns of 2 shots: 2 ground
         """
         returns = self.returns(detector, **{"max_returns": MAX_LAS_RETURNS, **options})
-        returns.to_las(path, crs=crs)
+        returns.to_las(path, crs=crs, extra=extra)
         return returns
 
     def to_las_waveforms(
