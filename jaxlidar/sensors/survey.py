@@ -12,6 +12,7 @@ double precision, as map coordinates of millions of metres need.
 """
 
 import dataclasses
+import itertools
 import math
 import operator
 from collections.abc import Sequence
@@ -654,14 +655,16 @@ class Survey(eqx.Module):
         - `pulse_rate`: shots per s, positive, from the start of each strip to its end. Default None: one shot
           at each time of the trajectory.
         - `mounting`: (roll, pitch, yaw) in degrees that turn the scanner into the body of the platform
-          (boresight angles). Default (0, 0, 0).
+          (boresight angles); or (channels, 3), for an instrument of several channels that fly together, such
+          as [(0, 0, 14), (0, 0, -14)] for the crossed lines of the RIEGL VQ-1560i. Default (0, 0, 0).
         - `lever_arm`: (forward, right, down) in m from the trajectory's position to the sensor, in the frame
           of the body. Default (0, 0, 0).
         - `above`: a `Terrain`: heights of the trajectory are then above that, and not above z = 0. Default
           None.
 
         **Returns:** a `Survey`, its shots in the order of time within each strip, with `gps_time`, the time
-        of the trajectory, `scan_angle`, and `flight_line`, which numbers the strips from 1.
+        of the trajectory, `scan_angle`, and `flight_line`, which numbers the strips from 1: all those of the
+        first channel, then those of the next.
 
         **Raises:** ValueError for values outside their ranges, no scan pattern, more shots than memory has
         room for, more than 65535 strips, a position off the terrain, and shots that look up, or more than 89
@@ -694,12 +697,15 @@ class Survey(eqx.Module):
         if pulse_rate is not None:
             check_number("pulse_rate", pulse_rate, 0.0, low_open=True)
             warn_unit("pulse_rate", pulse_rate, _PULSE_RATE)
-        scanner_turn = rotation_matrix(*three_numbers("mounting", mounting))
+        channels: Any = [mounting]
+        if isinstance(mounting, Sequence | np.ndarray) and len(mounting):
+            channels = mounting if all(np.ndim(row) == 1 for row in mounting) else channels
+        turns = [rotation_matrix(*three_numbers("mounting", row)) for row in channels]
         arm = three_numbers("lever_arm", lever_arm)
         durations = [float(strip.time[-1] - strip.time[0]) for strip in strips]
         if pulse_rate is not None:
             counts = [_count_along(duration, 1.0 / float(pulse_rate)) for duration in durations]
-            _check_number_of_shots(f"pulse_rate = {float(pulse_rate):g}", sum(counts))
+            _check_number_of_shots(f"pulse_rate = {float(pulse_rate):g}", len(turns) * sum(counts))
             strips = [
                 strip.at(np.minimum(strip.time[0] + np.arange(count) / float(pulse_rate), strip.time[-1]))
                 for strip, count in zip(strips, counts)
@@ -707,7 +713,8 @@ class Survey(eqx.Module):
         if above is not None:
             strips = [_lifted(strip, above) for strip in strips]
         return Survey.join(
-            _strip(lidar, strip, scan, number, scanner_turn, arm) for number, strip in enumerate(strips, 1)
+            _strip(lidar, strip, scan, number, turn, arm)
+            for number, (turn, strip) in enumerate(itertools.product(turns, strips), 1)
         )
 
 

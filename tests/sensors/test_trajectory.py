@@ -212,3 +212,27 @@ def test_flights_that_a_lidar_with_an_altitude_cannot_make():
         jl.Survey.fly([1.0], NADIR)
     with pytest.raises(TypeError, match="above"):
         jl.Survey.fly(flight(), NADIR, above=3.0)
+
+
+def test_channels_fly_together():
+    """Lines that are turned by 14 degrees either way cross: the edges look ahead by tan(29) sin(14)."""
+    flight = jl.Trajectory([0.0, 1.0], [(0, 0, 1000.0), (0, 60, 1000.0)])
+    lidar = jl.instrument("RIEGL VQ-1560i")
+    options = {"lidar": lidar, "pulse_rate": 3000.0}
+    both = jl.Survey.fly([flight, flight], mounting=[(0, 0, 14), (0, 0, -14)], **options)
+    assert np.unique(both.flight_line).tolist() == [1, 2, 3, 4]
+    for line, turn in ((1, 14), (2, 14), (3, -14), (4, -14)):
+        one = jl.Survey.fly(flight, mounting=(0, 0, turn), **options)
+        is_line = both.flight_line == line
+        np.testing.assert_array_equal(both.position[is_line], one.position)
+        np.testing.assert_array_equal(both.gps_time[is_line], one.gps_time)
+        # The first shot looks to the left: a turn to the right brings it ahead.
+        ahead = one.position[0, 1] / 1000.0
+        np.testing.assert_allclose(ahead, np.tan(np.deg2rad(29)) * np.sin(np.deg2rad(turn)), atol=1e-4)
+
+
+@pytest.mark.parametrize("mounting", [(0, 0), [(0, 0, 1), (0, 0)], [], [[]], "level"])
+def test_mountings_of_other_shapes_are_refused(mounting):
+    flight = jl.Trajectory([0.0, 1.0], [(0, 0, 100.0), (0, 60, 100.0)])
+    with pytest.raises((ValueError, TypeError), match="mounting"):
+        jl.Survey.fly(flight, jl.Conical(10.0, 5.0), mounting=mounting)
