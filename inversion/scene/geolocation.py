@@ -355,6 +355,8 @@ def _footprint_covariance(survey: Survey) -> Float[np.ndarray, "2 2"]:
         raise ValueError(f"survey.lidar.profile = {lidar.profile!r}; admissible is 'gaussian'")
     if lidar.field_of_view is not None:
         raise ValueError("survey.lidar.field_of_view is given; admissible is None")
+    if lidar.level_divergence is not None:
+        raise ValueError("survey.lidar.level_divergence is given; admissible is None, a round footprint")
     check_number("survey.lidar.divergence", lidar.divergence, 0.0, low_open=True)
     # The radius of a beam, at 1/e^2 of the irradiance, is two standard deviations.
     sigma = 0.5 * float(survey.footprint_radius[0])

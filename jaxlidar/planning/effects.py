@@ -78,6 +78,11 @@ def consists_of_planes(scene: Scene) -> bool:
     return scene.canopy is None and surfaces_are_planes(scene)
 
 
+def has_smooth_footprint(lidar: Lidar) -> bool:
+    """Return True if what is seen of the footprint is smooth but for circles, as `product_rule` needs."""
+    return lidar.level_divergence is None or lidar.field_of_view is None
+
+
 def surfaces_are_planes(scene: Scene) -> bool:
     """Return True if all surfaces of the scene are infinite planes with the same optics everywhere."""
     return all(isinstance(s.shape, Plane) and s.pattern is None for s in scene.surfaces)
@@ -225,7 +230,8 @@ def without_effects(lidar: Lidar, scene: Scene, off: tuple[str, ...]) -> tuple[L
     if not off:
         return lidar, scene
     if "divergence" in off:
-        lidar = dataclasses.replace(lidar, divergence=jnp.zeros_like(lidar.divergence))
+        no_width = {"divergence": jnp.zeros_like(lidar.divergence), "level_divergence": None}
+        lidar = dataclasses.replace(lidar, **no_width)
     if "field of view" in off:
         lidar = dataclasses.replace(lidar, field_of_view=None)
     if "jitter" in off:

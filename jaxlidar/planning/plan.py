@@ -34,6 +34,7 @@ from jaxlidar.planning.effects import (
     Effect,
     consists_of_planes,
     find_empty_materials,
+    has_smooth_footprint,
     present_effects,
     replace_plane_terrain,
     switched_off_effects,
@@ -457,7 +458,7 @@ def plan(
         # also serves wider beams.
         n_rays=int(n_rays) if wide_beam else 1,
         photons_per_batch=-(-int(n_photons) // MIN_BATCHES),
-        uses_quadrature=consists_of_planes(scene) and wide_beam,
+        uses_quadrature=consists_of_planes(scene) and has_smooth_footprint(lidar) and wide_beam,
         random_footprint=footprint == "random" and wide_beam,
     )
     limits = PathLimits(

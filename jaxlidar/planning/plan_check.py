@@ -18,7 +18,12 @@ from jaxlidar._constants import SPEED_OF_LIGHT
 from jaxlidar._fields.checks import concrete_number, fixed_array, is_traced
 from jaxlidar.optics.laws import AbstractMirror
 from jaxlidar.planning.channels import largest_albedo, scene_optics
-from jaxlidar.planning.effects import consists_of_planes, find_empty_materials, without_effects
+from jaxlidar.planning.effects import (
+    consists_of_planes,
+    find_empty_materials,
+    has_smooth_footprint,
+    without_effects,
+)
 from jaxlidar.planning.local_origin import move_aim_to_origin
 from jaxlidar.planning.orders import calls_for_more_orders, choose_orders
 from jaxlidar.planning.path_lengths import (
@@ -186,6 +191,10 @@ def _misfit_materials(plan: Plan, lidar: Lidar, scene: Scene, xp: Any) -> Iterat
     yield Misfit(
         config.uses_quadrature and not consists_of_planes(scene),
         lambda: "it is for planes; the scene has more",
+    )
+    yield Misfit(
+        config.uses_quadrature and not has_smooth_footprint(lidar),
+        lambda: "it is for a round beam, or no field of view; the lidar has level_divergence and both",
     )
     # Orders that the user chose are followed whatever the albedo. A larger albedo may still need no more.
     if scope.automatic_orders:

@@ -120,7 +120,8 @@ def _footprints(
     radius = survey.footprint_radius * distance / survey.slant_range
     # A level beam that meets no ground is a point, its sensor.
     cosine = np.maximum(np.abs(np.cos(np.deg2rad(survey.zenith))), np.cos(np.deg2rad(MAX_ZENITH)))
-    return points[:, :2], radius, radius / cosine
+    in_plane, across = (np.linalg.norm(axes, axis=1) for axes in survey.footprint_axes)
+    return points[:, :2], across * radius, in_plane * radius / cosine
 
 
 def _draw_relief(

@@ -133,6 +133,9 @@ class Lidar(eqx.Module):
     - `divergence`: full angle of the beam in mrad, in [0, 300]: the diameter of the footprint over the range,
       for small angles. For a Gaussian beam it is measured between the directions at 1/e^2 of the axial
       irradiance, for a top-hat across the disc. Default 0.3.
+    - `level_divergence`: that across the vertical plane of the beam, mrad, in (0, 300], of an elliptical
+      Gaussian beam; `divergence` is then that within this plane. A line scanner has it along the scan, a
+      terrestrial one across the level. Default None: as `divergence`, a round beam.
     - `aperture`: diameter of the receiver in m, positive. Default 0.2.
     - `zenith`: angle between the beam and straight down (nadir) in degrees, in [0, 89]; with `sensor` in
       [0, 180], where 90 is level and 180 straight up. Default 0.
@@ -222,6 +225,11 @@ class Lidar(eqx.Module):
     efficiency: Float[Array, "..."] = quantity(range=Range(0.0, 1.0, low_open=True), converter=as_array)
     receiver: Receiver | PhotonCounter
     scan: AbstractScan | None = eqx.field(static=True)
+    level_divergence: Float[Array, ""] | None = quantity(
+        unit=Magnitude("mrad", 4e-4, _MAX_DIVERGENCE, {"rad": 1e3, "urad": 1e-3}),
+        range=Range(0.0, _MAX_DIVERGENCE, low_open=True),
+        converter=as_optional_scalar,
+    )
 
     # Not the one of the dataclass: `sensor` is an argument, and a property that every lidar has.
     def __init__(
@@ -242,6 +250,7 @@ class Lidar(eqx.Module):
         efficiency: Any = 1.0,
         receiver: Any = _RECEIVER,
         scan: Any = None,
+        level_divergence: Any = None,
         sensor: Any = None,
     ):
         if sensor is not None:
@@ -272,7 +281,7 @@ class Lidar(eqx.Module):
         # Made here and not with the signature: importing the package starts no device.
         self.pulse = GaussianPulse() if isinstance(pulse, _Default) else pulse
         self.receiver = Receiver() if isinstance(receiver, _Default) else receiver
-        self.scan = scan
+        self.scan, self.level_divergence = scan, level_divergence
 
     def __check_init__(self):
         check_kind("pulse", self.pulse, AbstractPulse, "a pulse, such as GaussianPulse(fwhm=6.0)")
@@ -290,6 +299,16 @@ class Lidar(eqx.Module):
                 "in (0, inf)"
             )
         check_choice("profile", self.profile, ("gaussian", "top-hat"))
+        if self.level_divergence is not None:
+            if self.profile != "gaussian":
+                raise ValueError(
+                    "level_divergence is given with profile = 'top-hat'; admissible is 'gaussian', or None"
+                )
+            divergence = concrete(self.divergence)
+            if divergence is not None and not divergence > 0:
+                raise ValueError(
+                    "level_divergence is given with divergence = 0; admissible are both, or None"
+                )
         for field, value in (("energy", self.energy), ("efficiency", self.efficiency)):
             if value.shape not in ((), (1,), self.wavelength.shape):
                 raise ValueError(
@@ -385,10 +404,23 @@ class Lidar(eqx.Module):
         """Radius of the footprint in m: of the beam's cross-section at the aim point.
 
         The aim point lies on the reference plane, or 1 m ahead of a `sensor`. The radius is taken at 1/e^2 of
-        the axial irradiance, or at the edge of a top-hat, and perpendicular to the beam. On the plane
-        itself the footprint is longer by 1/cos(zenith) along the azimuth.
+        the axial irradiance, or at the edge of a top-hat, and perpendicular to the beam; it is the longer one
+        of an ellipse. On the plane itself the footprint is longer by 1/cos(zenith) along the azimuth.
         """
-        return self.range_to_reference * self.divergence * 0.5e-3
+        return self.range_to_reference * self.largest_divergence * 0.5e-3
+
+    @property
+    def largest_divergence(self) -> Float[Array, ""]:
+        """The larger one of the divergences of an elliptical beam, or that of a round one, mrad."""
+        level = self.level_divergence
+        return self.divergence if level is None else jnp.maximum(self.divergence, level)
+
+    @property
+    def ellipse(self) -> tuple[Float[Array, ""], Float[Array, ""]] | None:
+        """Semi-axes of the footprint over its radius, in the vertical plane and across; None if round."""
+        if self.level_divergence is None:
+            return None
+        return self.divergence / self.largest_divergence, self.level_divergence / self.largest_divergence
 
     @property
     def view_radius(self) -> Float[Array, ""] | None:

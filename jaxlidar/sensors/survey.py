@@ -465,7 +465,18 @@ class Survey(eqx.Module):
     @property
     def footprint_radius(self) -> Float[np.ndarray, " shots"]:
         """Radii (shots,) in m of the beams at the aim point, as `Lidar.footprint_radius`."""
-        return self.slant_range * concrete_number(self.lidar.divergence) * 0.5e-3
+        return self.slant_range * concrete_number(self.lidar.largest_divergence) * 0.5e-3
+
+    @property
+    def footprint_axes(self) -> tuple[Float[np.ndarray, "shots 3"], Float[np.ndarray, "shots 3"]]:
+        """Semi-axes (shots, 3) of footprints over `footprint_radius`: in the vertical plane, and level."""
+        zenith, azimuth = np.deg2rad(self.zenith), np.deg2rad(self.azimuth)
+        sin, cos = np.sin(azimuth), np.cos(azimuth)
+        vertical = np.stack([np.cos(zenith) * sin, np.cos(zenith) * cos, np.sin(zenith)], axis=-1)
+        level = np.stack([cos, -sin, np.zeros_like(sin)], axis=-1)
+        ratios = [1.0, 1.0] if self.lidar.ellipse is None else map(concrete_number, self.lidar.ellipse)
+        in_plane, across = ratios
+        return in_plane * vertical, across * level
 
     @staticmethod
     def grid(lidar: Lidar, low: Numbers, high: Numbers, spacing: Numbers) -> "Survey":

@@ -239,6 +239,8 @@ def reason_against_sharing(survey: Survey, setup: Setup, rtol: float) -> str | N
         return "nothing is random"
     if concrete_number(lidar.divergence) == 0:
         return "the beam has no width"
+    if lidar.ellipse is not None:
+        return "the footprint is an ellipse"
     # Where leaves transmit straight on, extinction depends on wavelength: photons cannot be shared among
     # wavelengths.
     if canopy is not None and canopy.is_straight:

@@ -260,9 +260,8 @@ def off_map(survey: Survey, scene: Scene) -> Float[np.ndarray, " shots"]:
     for first in range(0, len(shots), _SHOTS_PER_BLOCK):
         numbers = shots[first : first + _SHOTS_PER_BLOCK]
         block = survey.subset(numbers)
-        axis, azimuth = block.direction, np.deg2rad(block.azimuth)
-        across = np.stack([np.cos(azimuth), -np.sin(azimuth)], axis=-1)
-        along = np.stack([-across[:, 1], across[:, 0]], axis=-1) / -axis[:, 2:]
+        axis, (vertical, level) = block.direction, block.footprint_axes
+        across, along = level[:, :2], vertical[:, :2] / axis[:, 2:] ** 2
         points = disc[:, :1] * across[:, None] + disc[:, 1:] * along[:, None]
         points = block.position[:, None] + block.footprint_radius[:, None, None] * points
         outside = np.zeros(points.shape[:2], bool)

@@ -225,8 +225,7 @@ class _FirstHits:
         radius = np.sqrt(-0.5 * np.log1p(-enclosed) if part.lidar.profile == "gaussian" else enclosed)
         turn = 2.0 * np.pi * GOLDEN * np.arange(n_rays)
         reach = (part.footprint_radius / part.slant_range)[:, None, None]
-        axis = part.direction
-        first, second = _across(axis)
+        axis, (first, second) = part.direction, part.footprint_axes
         disc = np.cos(turn)[:, None] * first[:, None] + np.sin(turn)[:, None] * second[:, None]
         rays = axis[:, None] + reach * radius[:, None] * disc
         return rays / np.linalg.norm(rays, axis=2, keepdims=True)
@@ -247,14 +246,6 @@ def _stated_instances(meshes: Sequence[MeshSurface]) -> tuple[np.ndarray, np.nda
     triangles = [np.zeros(len(mesh.faces), int) if a is None else a for mesh, a in zip(meshes, triangles)]
     none = np.zeros(0, int)
     return np.concatenate([none, *copies]), np.concatenate([none, *triangles])
-
-
-def _across(axis: Float[np.ndarray, "shots 3"]) -> tuple[np.ndarray, np.ndarray]:
-    """Return two unit vectors across each axis, and across each other."""
-    reference = np.where(np.abs(axis[:, 2:]) < 0.9, [[0.0, 0.0, 1.0]], [[1.0, 0.0, 0.0]])
-    first = np.cross(reference, axis)
-    first /= np.linalg.norm(first, axis=1, keepdims=True)
-    return first, np.cross(axis, first)
 
 
 def _meet_triangles(tree: MeshTree, x: Float[Array, "rays 3"], w: Float[Array, "rays 3"]) -> tuple[Any, ...]:

@@ -25,7 +25,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from jaxlidar._vectors import FAR, Scalar, Vec, add, dot, from_frame, normalise, scale, vec
+from jaxlidar._vectors import FAR, Scalar, Vec, add, dot, from_frame, normalise, scale, to_frame, vec
 from jaxlidar.sensors.field_of_view import visible_fraction
 from jaxlidar.sensors.lidar import Lidar
 
@@ -40,7 +40,8 @@ class Beam(eqx.Module):
     """Axis, slant range and receiver of a lidar, as the tracer needs them.
 
     - `axis`: direction of the beam. `slant_range`: from the sensor to the aim point, m.
-    - `radius`: of the footprint at 1/e^2 or of the top-hat, m across the beam at the aim point.
+    - `radius`: of the footprint at 1/e^2 or of the top-hat, m across the beam at the aim point; the longer
+      one of an ellipse.
     - `half_angle`: that the aperture subtends at the aim point, rad.
     - `view_radius`: of the field of view at the aim point, m across the beam; None where everything is seen.
     - `from_sensor`: True if path lengths count from the sensor, and not from the aim point.
@@ -49,6 +50,8 @@ class Beam(eqx.Module):
     - `return_direction`: unit vector towards the receiver of parallel light where that is not back along the
       axis; else None. `rectangle`: corner and size, m, of the area of the reference plane over which parallel
       light enters evenly; None for a disc.
+    - `ellipse`: unit vector of an axis of an elliptical footprint in the frame of the beam axis, as x and y,
+      and the semi-axes along it and across it over the radius; None for a round one.
     """
 
     axis: Vec
@@ -61,6 +64,7 @@ class Beam(eqx.Module):
     from_sensor: bool = eqx.field(static=True, default=False)
     return_direction: Vec | None = None
     rectangle: tuple[Float[Array, "2"], Float[Array, "2"]] | None = None
+    ellipse: tuple[Scalar, Scalar, Scalar, Scalar] | None = None
 
     @property
     def range_at_time_zero(self) -> Scalar:
@@ -180,8 +184,13 @@ class Beam(eqx.Module):
 
     def irradiance(self, across: tuple[Scalar, Scalar]) -> Scalar:
         """Fraction of the pulse's energy per m2 across the beam, at x and y across it, m."""
-        r2 = across[0] ** 2 + across[1] ** 2
         radius2 = jnp.maximum(self.radius, 1e-6) ** 2
+        if self.ellipse is None:
+            r2 = across[0] ** 2 + across[1] ** 2
+        else:
+            x, y, a, b = self.ellipse
+            along, aside = across[0] * x + across[1] * y, across[1] * x - across[0] * y
+            r2, radius2 = ((along / a) ** 2 + (aside / b) ** 2) * (a * b), radius2 * (a * b)
         if self.gaussian:
             return 2.0 / (np.pi * radius2) * jnp.exp(-jnp.minimum(2.0 * r2 / radius2, 80.0))
         return jnp.where(r2 <= radius2, 1.0 / (np.pi * radius2), 0.0)
@@ -189,22 +198,29 @@ class Beam(eqx.Module):
 
 def make_beam(lidar: Lidar) -> Beam:
     """Make the beam of a lidar."""
-    slant = lidar.range_to_reference
+    slant, axis, ellipse = lidar.range_to_reference, vec(lidar.direction), None
+    if lidar.ellipse is not None:
+        # The level direction across the beam is (cos, -sin, 0) of the azimuth; the other lies beside it.
+        azimuth = jnp.deg2rad(lidar.azimuth)
+        x, y, _ = to_frame(axis, vec([jnp.cos(azimuth), -jnp.sin(azimuth), jnp.zeros_like(azimuth)]))
+        in_plane, level = lidar.ellipse
+        ellipse = (x, y, level, in_plane)
     return Beam(
-        vec(lidar.direction),
+        axis,
         slant,
         lidar.footprint_radius,
         lidar.aperture_half_angle,
         lidar.view_radius,
         lidar.profile == "gaussian",
         from_sensor=lidar.has_sensor_position,
+        ellipse=ellipse,
     )
 
 
 def parallel_beam(lidar: Lidar) -> Beam:
     """Make a beam of parallel light in the lidar's direction, for a receiver that sees everything."""
     beam = make_beam(lidar)
-    return dataclasses.replace(beam, view_radius=None, gaussian=False, parallel=True)
+    return dataclasses.replace(beam, view_radius=None, gaussian=False, parallel=True, ellipse=None)
 
 
 def bistatic_beam(
@@ -233,6 +249,15 @@ def from_polar(radius: Scalar, turn: Scalar) -> tuple[Scalar, Scalar]:
     return radius * jnp.cos(2 * np.pi * turn), radius * jnp.sin(2 * np.pi * turn)
 
 
+def _stretched(beam: Beam, point: tuple[Scalar, Scalar]) -> tuple[Scalar, Scalar]:
+    """Return a point of a round footprint, moved to where it lies in an elliptical one."""
+    if beam.ellipse is None:
+        return point
+    x, y, a, b = beam.ellipse
+    along, aside = a * point[0], b * point[1]
+    return x * along - y * aside, y * along + x * aside
+
+
 def across_beam(beam: Beam, energy_fraction: Scalar, turn: Scalar) -> tuple[Scalar, Scalar]:
     """Return the point across the beam, m, whose circle encloses `energy_fraction`, or of a rectangle."""
     if beam.rectangle is not None:
@@ -241,9 +266,8 @@ def across_beam(beam: Beam, energy_fraction: Scalar, turn: Scalar) -> tuple[Scal
         return corner[0] + size[0] * energy_fraction, corner[1] + size[1] * (turn - jnp.floor(turn))
     # All of a Gaussian beam's energy is within an infinite circle.
     enclosed = jnp.clip(energy_fraction, 0.0, 1.0 - 1e-7)
-    return from_polar(
-        beam.radius * jnp.sqrt(-0.5 * jnp.log1p(-enclosed) if beam.gaussian else enclosed), turn
-    )
+    radius = beam.radius * jnp.sqrt(-0.5 * jnp.log1p(-enclosed) if beam.gaussian else enclosed)
+    return _stretched(beam, from_polar(radius, turn))
 
 
 class RaySlice(NamedTuple):
@@ -305,7 +329,7 @@ def product_rule(
 
     It is Gauss-Laguerre in 2 r^2 / w0^2 for the Gaussian beam, and Gauss-Legendre in r^2 for the top-hat. At
     the edge of a field of view the integrand is not smooth: there, panels of a Gauss-Legendre rule in r end
-    at the edge.
+    at the edge. Plans do not use it where the footprint is an ellipse, which meets that edge at many r.
 
     **Returns:** as `fibonacci_disc`.
     """
@@ -320,7 +344,7 @@ def product_rule(
         r, weight = beam.radius * jnp.sqrt(jnp.asarray((x + 1) / 2)), jnp.asarray(weight / 2)
     a = 2 * np.pi * (np.arange(angular) + 0.5) / angular
     x, y = (jnp.outer(r, jnp.asarray(f(a))).reshape(-1) for f in (np.cos, np.sin))
-    return (x, y), jnp.repeat(weight / angular, angular)
+    return _stretched(beam, (x, y)), jnp.repeat(weight / angular, angular)
 
 
 def _rule_with_edge(

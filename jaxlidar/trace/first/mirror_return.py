@@ -95,7 +95,7 @@ def mirror_rays(
     # Divided by the aperture's squared half-angle, the fraction of the energy is apparent reflectance.
     unit = (distance / aperture) ** 2
     value = unit * irradiance * caught / jnp.maximum(density, _TINY) / (2 * n_half)
-    if beam.gaussian:
+    if beam.gaussian and beam.ellipse is None:
         estimate = jnp.sum(value)
         is_seen = estimate > _TINY
         exact = unit * gaussian_within(_length(miss), jnp.hypot(beam.radius, sigma), aperture)

@@ -1,0 +1,196 @@
+"""Elliptical footprints: moments over tilted planes, step edges by the error function, and what sees them.
+
+With the semi-axes w1 in the vertical plane of the beam and w2 across it, at 1/e^2, a Gaussian footprint has
+the standard deviations w1 / 2 and w2 / 2. Beyond a straight edge at the distance d from the axis, with the
+unit normal (c, s) in these axes, lies the fraction
+
+    1/2 erfc(sqrt(2) d / w),   w^2 = (c w1)^2 + (s w2)^2.
+"""
+
+import dataclasses
+import math
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxlidar as jl
+from jaxlidar.survey.coverage import off_map
+
+VERTICAL, LEVEL = 8.0, 3.0
+PULSE = jl.GaussianPulse(fwhm=0.5)
+
+
+def lidar(zenith=0.0, azimuth=0.0, *, placed_by="altitude", **fields):
+    fields = {
+        "divergence": VERTICAL,
+        "level_divergence": LEVEL,
+        "pulse": PULSE,
+        "sampling_interval": 0.1,
+    } | fields
+    if placed_by == "altitude":
+        return jl.Lidar(altitude=500.0, zenith=zenith, azimuth=azimuth, **fields)
+    # The axis passes the origin.
+    axis = np.asarray(jl.Lidar(zenith=zenith, azimuth=azimuth).direction, float)
+    return jl.Lidar(sensor=-500.0 * axis, zenith=zenith, azimuth=azimuth, **fields)
+
+
+def simulate(lidar, scene, **options):
+    return jl.simulate(lidar, scene, key=jax.random.key(0), **({"max_orders": 1} | options))
+
+
+@pytest.mark.parametrize("placed_by", ["altitude", "sensor"])
+@pytest.mark.parametrize("aspect", [30.0, 60.0, 120.0])
+def test_a_tilted_plane_has_the_second_moment_of_the_ellipse(placed_by, aspect):
+    """The variance of ranges at nadir is that of heights: tan^2(slope) times that of the footprint."""
+    azimuth, slope = 30.0, 20.0
+    beam = lidar(azimuth=azimuth, placed_by=placed_by)
+    wave = simulate(beam, jl.Scene(ground=jl.Ground(reflectance=0.3, slope=slope, aspect=aspect)))
+    time, power = (np.asarray(a, float) for a in (wave.time, wave.reflectance[0]))
+    mean = np.sum(power * time) / power.sum()
+    variance = np.sum(power * (time - mean) ** 2) / power.sum()
+    # Along the azimuth and across it, to the right.
+    turn = math.radians(aspect - azimuth)
+    w1, w2 = (0.5e-3 * d * 500.0 for d in (VERTICAL, LEVEL))
+
+    def of_footprint(w1, w2):
+        sigma = 0.5 * math.hypot(math.cos(turn) * w1, math.sin(turn) * w2)
+        return (2.0 / 0.299792458 * math.tan(math.radians(slope)) * sigma) ** 2
+
+    sampled = float(PULSE.std) ** 2 + 0.1**2 / 12.0
+    np.testing.assert_allclose(variance - sampled, of_footprint(w1, w2), rtol=0.01)
+    # The planted wrong answer: axes that are swapped.
+    assert abs(variance - sampled - of_footprint(w2, w1)) > 0.05 * variance
+
+
+def half_plane(normal, distance, zenith=0.0, azimuth=0.0):
+    """A mesh across a beam, 40 m wide, that begins `distance` m from its axis in the direction `normal`.
+
+    `normal`: in the vertical plane of the beam and across it, to the right.
+    """
+    zenith, azimuth = np.deg2rad(zenith), np.deg2rad(azimuth)
+    sin, cos = np.sin(azimuth), np.cos(azimuth)
+    vertical = np.array([np.cos(zenith) * sin, np.cos(zenith) * cos, np.sin(zenith)])
+    level = np.array([cos, -sin, 0.0])
+    first = normal[0] * vertical + normal[1] * level
+    second = normal[1] * vertical - normal[0] * level
+    corners = [distance * first + a * first + b * second for a, b in ((0, -20), (40, -20), (40, 20), (0, 20))]
+    return jl.MeshSurface((corners, [(0, 1, 2), (0, 2, 3)]), reflectance=0.5)
+
+
+def beyond_edge(normal, distance, w1=0.5e-3 * VERTICAL * 500.0, w2=0.5e-3 * LEVEL * 500.0):
+    return 0.5 * math.erfc(math.sqrt(2.0) * distance / math.hypot(normal[0] * w1, normal[1] * w2))
+
+
+@pytest.mark.parametrize("placed_by", ["altitude", "sensor"])
+@pytest.mark.parametrize("zenith", [0.0, 40.0])
+def test_a_step_edge_has_the_share_of_the_error_function(placed_by, zenith):
+    azimuth = 70.0
+    slant = 500.0 if placed_by == "sensor" or zenith == 0 else 500.0 / math.cos(math.radians(zenith))
+    for turn in (0.0, 35.0, 90.0, 145.0):
+        normal = (math.cos(math.radians(turn)), math.sin(math.radians(turn)))
+        scene = jl.Scene(meshes=[half_plane(normal, 0.6, zenith, azimuth)])
+        wave = simulate(lidar(zenith, azimuth, placed_by=placed_by), scene, rtol=0.003)
+        axes = [0.5e-3 * d * slant for d in (VERTICAL, LEVEL)]
+        share = float(wave.reflectance.sum()) / 0.5
+        np.testing.assert_allclose(share, beyond_edge(normal, 0.6, *axes), atol=0.006)
+    # The planted wrong answer: the round footprint of the larger divergence, across the level.
+    assert abs(beyond_edge((0, 1), 0.6) - beyond_edge((1, 0), 0.6)) > 0.1
+
+
+def test_equal_divergences_are_a_round_beam():
+    scene = jl.Scene(ground=jl.Ground(reflectance=0.3, slope=25.0, aspect=60.0))
+    pulse = {"pulse": jl.GaussianPulse(fwhm=8.0)}
+    round_beam, ellipse = (lidar(20.0, 30.0, level_divergence=d, **pulse) for d in (None, VERTICAL))
+    a, b = (np.asarray(simulate(beam, scene).reflectance) for beam in (round_beam, ellipse))
+    np.testing.assert_allclose(a, b, atol=1e-3 * a.max())
+    assert round_beam.ellipse is None
+
+
+def test_higher_orders_enter_over_the_ellipse():
+    """Half a plane of leaves returns that share of a whole one, of all orders, which the footprint lights."""
+    voxels = jl.VoxelMap.from_lad(
+        np.full((40, 40, 1), 3.0), voxel_size=(1.0, 1.0, 3.0), origin=(0.4, -20.0, 0.0)
+    )
+    canopy = jl.Canopy(voxels, leaf=jl.LeafOptics(0.5, 0.4))
+    beam = lidar(azimuth=90.0)
+    wave = simulate(beam, jl.Scene(canopy=canopy), max_orders=4, rtol=0.02)
+    wide = simulate(
+        beam,
+        jl.Scene(
+            canopy=dataclasses.replace(
+                canopy, voxels=dataclasses.replace(voxels, origin=jnp.array([-20.0, -20.0, 0.0]))
+            )
+        ),
+        max_orders=4,
+        rtol=0.02,
+    )
+    # The edge lies east of the axis, along the azimuth; light that is scattered across it is little.
+    for name, tolerance in (("first", 0.01), ("higher", 0.06)):
+        share = float(wave.components[name].sum() / wide.components[name].sum())
+        assert abs(share - beyond_edge((1, 0), 0.4)) < tolerance
+
+
+def test_the_derivative_of_an_edge_by_both_divergences():
+    """d share / d divergence by the closed form; the edge lies at 30 degrees from the vertical plane."""
+    turn = math.radians(30.0)
+    normal = (math.cos(turn), math.sin(turn))
+    scene = jl.Scene(ground=jl.Ground(reflectance=0.3, slope=20.0, aspect=30.0))
+    beam = lidar(sampling_interval=0.5)
+    made = jl.plan(beam, scene, max_orders=1)
+
+    def variance(divergences):
+        moved = eqx.tree_at(lambda a: (a.divergence, a.level_divergence), beam, tuple(divergences))
+        wave = jl.simulate(moved, scene, key=jax.random.key(0), plan=made)
+        power, time = wave.reflectance[0], wave.time
+        mean = jnp.sum(power * time) / jnp.sum(power)
+        return jnp.sum(power * (time - mean) ** 2) / jnp.sum(power)
+
+    slopes = jax.grad(variance)(jnp.array([VERTICAL, LEVEL]))
+    scale = (2.0 / 0.299792458 * math.tan(math.radians(20.0)) * 0.25e-3 * 500.0) ** 2
+    expected = [2.0 * scale * c**2 * d for c, d in zip(normal, (VERTICAL, LEVEL))]
+    np.testing.assert_allclose(slopes, expected, rtol=0.02)
+
+
+def test_surveys_labels_and_coverage_see_the_ellipse():
+    beam = lidar(placed_by="sensor")
+    # Panels east and north of the axis, 1 m away: outside the ellipse's level axis, within the other.
+    panels = [half_plane((1, 0), 1.0), half_plane((0, 1), 1.0)]
+    survey = jl.Survey(beam, sensor=[(0, 0, 500.0)])
+    many = jl.simulate_many(
+        survey,
+        jl.Scene(meshes=panels, ground=jl.Ground(height=-10.0)),
+        key=jax.random.key(0),
+        max_orders=1,
+        rtol=0.01,
+    )
+    share = {name: float(a.sum()) for name, a in many.components.items() if name.startswith("mesh")}
+    np.testing.assert_allclose(share["mesh 1"] / 0.5, beyond_edge((1, 0), 1.0), atol=0.01)
+    assert share["mesh 2"] / 0.5 < 0.01
+    assert float(survey.footprint_radius[0]) == pytest.approx(0.5e-3 * VERTICAL)
+    # Labels: rays that meet the first panel, and none the second.
+    returns = many.returns().labelled(survey, jl.Scene(meshes=panels, ground=jl.Ground(height=-10.0)))
+    assert returns.instance.tolist() == [1, 0]
+    # Off the map: what lies beyond its border.
+    voxels = jl.VoxelMap.from_lad(np.ones((10, 10, 1)), voxel_size=10.0, origin=(0.6, -50.0, 0.0))
+    canopy = jl.Canopy(voxels, leaf=jl.LeafOptics(0.4, 0.4))
+    for azimuth, normal in ((90.0, (1, 0)), (0.0, (0, 1))):
+        one = jl.Survey(lidar(azimuth=azimuth), position=[(0.0, 0.0)], azimuth=azimuth)
+        off = off_map(one, jl.Scene(canopy=canopy))
+        np.testing.assert_allclose(1.0 - off[0], beyond_edge(normal, 0.6), atol=0.01)
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"profile": "top-hat"}, "level_divergence is given with profile = 'top-hat'"),
+        ({"level_divergence": 0.0}, r"level_divergence = 0 .*\(0, 300\]"),
+        ({"divergence": 0.0}, "level_divergence is given with divergence = 0"),
+        ({"level_divergence": [1.0, 2.0]}, "level_divergence has shape"),
+    ],
+)
+def test_inadmissible_ellipses_are_refused(fields, message):
+    with pytest.raises(ValueError, match=message):
+        lidar(**fields)
