@@ -22,6 +22,8 @@ lattice of eight times as many rays, which has no gaps. If a lattice of N rays h
 all eight is c (8 N)^-a. It is 8^(1/2 - a) times what their scatter tells, the standard error of the mean of
 eight independent ones. Seen from straight above, returns jump at the edges of columns: a = 3/4. A slant beam
 enters voxels by their sides as well, so that returns bend where they would jump: a = 0.85, found by trial.
+Beams straight down have rays in every column that they graze, with weights by the exact share of its energy
+(`trace.first.lattices_of_shots.strips_of_columns`), so that no error stays unseen for want of rays.
 `examples/validation/standard_errors.py` compares the errors that follow with the scatter of many keys. Shots
 that are not within the tolerance get more parts, as many as the error of each asks for.
 """
@@ -62,15 +64,24 @@ from jaxlidar.survey.results import SAMPLED_ARRAYS, ShotErrors, make_shot_result
 from jaxlidar.survey.strategy import AbstractStrategy, Shots, slices_of_shots, without_padding
 from jaxlidar.trace.device_scene import DeviceScene, aim_at, build_device_scene
 from jaxlidar.trace.first.first_order import FirstOrderTally
-from jaxlidar.trace.first.footprint import RaySlice, interleaving_shifts, make_beam
+from jaxlidar.trace.first.footprint import (
+    Beam,
+    FootprintStrips,
+    RaySlice,
+    interleaving_shifts,
+    make_beam,
+)
 from jaxlidar.trace.first.lattices_of_shots import (
     LatticeParts,
     LatticeSums,
     add_parts,
     can_trace_parts,
     empty_tally,
+    energy_of_lattices,
     lattice_sums,
+    per_unit_energy,
     response_of_lattice,
+    strips_of_columns,
 )
 from jaxlidar.trace.response import Response, footprint_shift, trace_device_scene, trace_first_only
 
@@ -507,13 +518,17 @@ def _trace_narrow_shots(
 def error_of_interleaved(scene: DeviceScene, zenith: Array | np.ndarray) -> Array:
     """Return the standard error of the mean of interleaved lattices over that of as many independent ones.
 
-    `zenith`: degrees, of the beam, which is slant if it crosses half a voxel on its way through the map.
+    `zenith`: degrees, of the beam.
     """
+    return MIN_BATCHES ** (0.5 - jnp.where(is_slant(scene, zenith), _RATE_OF_SLANT, _RATE_AT_NADIR))
+
+
+def is_slant(scene: DeviceScene, zenith: Array | np.ndarray) -> Array:
+    """Return True for beams that cross half a voxel on their way through the map; `zenith`: degrees."""
     assert scene.medium is not None
     angle, size = jnp.deg2rad(zenith), scene.medium.size
     sideways = size[2] * scene.medium.counts[2] * jnp.abs(jnp.sin(angle))
-    is_slant = sideways > 0.5 * jnp.minimum(size[0], size[1]) * jnp.abs(jnp.cos(angle))
-    return MIN_BATCHES ** (0.5 - jnp.where(is_slant, _RATE_OF_SLANT, _RATE_AT_NADIR))
+    return sideways > 0.5 * jnp.minimum(size[0], size[1]) * jnp.abs(jnp.cos(angle))
 
 
 def trace_together(
@@ -525,7 +540,8 @@ def trace_together(
 ) -> dict[str, Any]:
     """Trace the lattices of a group of shots, each in `n_parts` parts.
 
-    1. List the parts of all lattices of all shots, shot by shot.
+    1. List the parts of all lattices of all shots, shot by shot. Of beams straight down, spread the rays over
+       the columns of voxels.
     2. Trace them, a block of parts at a time, and add them to the tally of their lattices.
     3. Apply optics and pulse to the lattices of each shot, whose scatter tells the errors, and to their mean.
     """
@@ -547,6 +563,13 @@ def trace_together(
     scene_of_first = aim_at(scene, lidar, offsets[0])
     aims = jnp.pad(offsets - offsets[:1], ((0, 0), (0, 3 - offsets.shape[1])))
 
+    def strips_of(shot: ShotGeometry, beam: Beam, aim: Array, n_parts: Array) -> FootprintStrips:
+        is_straight_down = ~is_slant(scene, shot.zenith) & (beam.axis[2] < 0.0)
+        n_rays, is_spread = n_parts * RAYS_OF_PART * MIN_BATCHES, is_straight_down & beam.gaussian
+        return strips_of_columns(scene_of_first, beam, aim, n_rays, MIN_BATCHES, is_spread)
+
+    strips = jax.vmap(strips_of)(shots, beams, aims, n_parts)
+
     # Step 2.
     def add_block(block: Array, tally: FirstOrderTally) -> FirstOrderTally:
         number = block * block_size + jnp.arange(block_size, dtype=jnp.int32)
@@ -562,6 +585,7 @@ def trace_together(
             aims=aims[row],
             shifts=shifts[row, lattice],
             ray_slices=RaySlice(jnp.where(exists, part, 0), count),
+            strips=jax.tree.map(lambda a: a[row, lattice], strips),
         )
         return add_parts(scene_of_first, tally, parts, n_lattices, RAYS_OF_PART)
 
@@ -576,17 +600,19 @@ def trace_together(
     )
 
     # Step 3.
-    def results_of(shot: ShotGeometry, sums: LatticeSums) -> dict[str, Any]:
+    def results_of(shot: ShotGeometry, sums: LatticeSums, strips: FootprintStrips) -> dict[str, Any]:
         aimed = context.aim(shot, key)
         aimed = aimed._replace(model=aimed.model.for_applied_optics())
         responses = jax.vmap(lambda s: response_of_lattice(scene, s, context.model.optics))(sums)
         values = jax.vmap(lambda response: _total_and_budget(response, aimed.model))(responses)
-        moments = RunningMoments.of_batches(values, responses)
-        batch = ShotBatch.of_response(moments.mean_only, aimed.model)
+        energy = energy_of_lattices(sums, strips)
+        moments = RunningMoments.of_batches(per_unit_energy(values, energy), responses)
+        response = jax.tree.map(lambda a: a / jnp.mean(energy), moments.mean_only)
+        batch = ShotBatch.of_response(response, aimed.model)
         factor = error_of_interleaved(scene, shot.zenith)
         return _shot_results(aimed, moments._replace(mean_only=batch), kept_names, factor)
 
-    return jax.vmap(results_of)(shots, sums)
+    return jax.vmap(results_of)(shots, sums, strips)
 
 
 def _trace_shots(

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy.special
 
 import jaxlidar as jl
 from jaxlidar.survey.choose_strategy import choose_strategy
@@ -20,8 +21,20 @@ from jaxlidar.survey.per_shot import (
 )
 from jaxlidar.trace.device_scene import aim_at, build_device_scene
 from jaxlidar.trace.first.first_order import first_order
-from jaxlidar.trace.first.footprint import RaySlice, fibonacci_disc, interleaving_shifts, make_beam
-from jaxlidar.trace.first.lattices_of_shots import LatticeParts, add_parts, empty_tally, lattice_sums
+from jaxlidar.trace.first.footprint import (
+    RaySlice,
+    fibonacci_disc,
+    interleaving_shifts,
+    make_beam,
+    spread_over_strips,
+)
+from jaxlidar.trace.first.lattices_of_shots import (
+    LatticeParts,
+    add_parts,
+    empty_tally,
+    lattice_sums,
+    strips_of_columns,
+)
 from tests.helpers import BY_PRECISION
 
 KEY = jax.random.key(5)
@@ -102,6 +115,70 @@ def test_interleaved_lattices_miss_less_than_independent_ones():
     assert interleaved[0] < 0.5 * interleaved[1]
     # Of independent ones the scatter is the squared error.
     assert 0.9 < independent[0] / independent[1] < 1.1
+
+
+@BY_PRECISION
+def test_rays_are_spread_over_the_columns_that_a_footprint_grazes(precision):
+    """The share beyond an edge is exact by any shift; planted: rays of equal energies miss it by most."""
+    strategy = strategy_of(narrow_shots(2), edge())
+    scene, beam, n_lattices, n_rays = strategy.context.scene, make_beam(NARROW), 8, 8
+    # The edge of a column lies 1.5 radii of the footprint to the east, and one 0.3 radii to the south.
+    radius = float(beam.radius)
+    offset = jnp.asarray([10.0 - 1.5 * radius, 10.0 + 0.3 * radius, 0.0])
+    aim = scene.medium.origin + offset
+
+    def shares(shift, is_spread):
+        """Return the shares of the energy beyond the edges, and of the rays of the first."""
+        strips = strips_of_columns(scene, beam, aim, n_lattices * n_rays, n_lattices, is_spread)
+
+        def rays_of(shift, strips):
+            rays = fibonacci_disc(beam, n_rays, shift)
+            return spread_over_strips(beam, *rays, strips)
+
+        (x, y), energy = jax.vmap(rays_of)(interleaving_shifts(shift, n_lattices), strips)
+        is_beyond = jnp.stack([x > 1.5 * radius, y > 0.3 * radius])
+        share = jnp.sum(jnp.where(is_beyond, energy, 0.0), axis=(1, 2)) / jnp.sum(energy)
+        return *share, jnp.mean(is_beyond[0])
+
+    shifts = jnp.asarray(np.random.default_rng(2).uniform(size=(400, 2)))
+    east, south, rays = (np.asarray(a) for a in jax.vmap(lambda s: shares(s, jnp.asarray(True)))(shifts))
+    exact_east, exact_south = scipy.special.ndtr([-3.0, -0.6])
+    # One ray of eight is beyond the edge, give or take one or two of 64.
+    assert 64 * rays.min() >= 5
+    assert 64 * rays.max() <= 11
+    assert abs(east.mean() / exact_east - 1.0) < 0.03
+    assert np.abs(east / exact_east - 1.0).max() < 0.45
+    assert abs(south.mean() / exact_south - 1.0) < 0.01
+    assert np.abs(south - exact_south).max() < 0.06
+    # Planted.
+    equal = np.asarray(jax.vmap(lambda s: shares(s, jnp.asarray(False)))(shifts)[0])
+    assert np.mean(equal == 0.0) > 0.8
+    assert equal.max() > 10.0 * exact_east
+
+
+@pytest.mark.slow
+def test_errors_of_shots_straight_down_that_graze_columns_are_those_reported():
+    random = np.random.default_rng(3)
+    density = np.where(random.random((20, 20, 8)) < 0.5, 1.0, 0.0)
+    canopy = jl.Canopy(jl.VoxelMap.from_lad(density, voxel_size=1.0), leaf=jl.Prospect(), hotspot=False)
+    scene = terrain_under(jl.Scene(canopy=canopy, ground=jl.Ground(reflectance=0.3)))
+    survey = jl.Survey(NARROW, random.uniform(2.0, 18.0, (100, 2)), 0.0)
+    draws = [
+        jl.simulate_many(survey, scene, key=key, max_orders=1, rtol=0.02)
+        for key in jax.random.split(jax.random.key(11), 16)
+    ]
+    values, errors = (np.stack([np.asarray(getattr(w, n)) for w in draws]) for n in ("reflectance", "stderr"))
+    mean, typical = values.mean(axis=0), np.sqrt(np.mean(errors**2, axis=0))
+    largest = mean.max(axis=-1, keepdims=True)
+    # Rays are not quite parallel. Where two columns return the same, the few that cross from one to the other
+    # on their way are all that differs: such errors are below the second bound and not always told.
+    counts = (mean > 0.01 * largest) & (typical > 5e-4 * largest)
+    deviation = (values - mean)[:, counts] * np.sqrt(16 / 15)
+    z = deviation / np.maximum(errors[:, counts], 0.1 * typical[counts])
+    assert 0.85 < np.sqrt(np.mean(z**2)) < 1.15
+    assert np.mean(np.abs(z) < 2.0) > 0.93
+    # Planted: errors a third smaller.
+    assert np.mean(np.abs(z) < 4.0 / 3.0) < 0.88
 
 
 @pytest.mark.slow

@@ -21,6 +21,7 @@ import dataclasses
 from typing import NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
@@ -298,6 +299,43 @@ def fibonacci_disc(
     turned = (before.astype(jnp.uint32) * np.uint32(round(GOLDEN * 2**32))).astype(u.dtype) * 2.0**-32
     turn = jnp.asarray((np.arange(count) * GOLDEN) % 1.0, u.dtype) + turned + shift[1]
     return across_beam(beam, u, turn), jnp.full((count,), 1.0 / count, u.dtype)
+
+
+class FootprintStrips(NamedTuple):
+    """Strips of a Gaussian footprint between lines across each axis, from its low end on.
+
+    `rays`, `energy`: fractions of all rays, and of the energy, before the strip begins. `stretch`: its energy
+    over its rays. `weight`: of each of its rays, which is one in all strips where rays are not spread.
+    """
+
+    rays: Float[Array, "axes strips"]
+    energy: Float[Array, "axes strips"]
+    stretch: Float[Array, "axes strips"]
+    weight: Float[Array, "axes strips"]
+
+
+def spread_over_strips(
+    beam: Beam, across: tuple[Scalar, Scalar], energy: Scalar, strips: FootprintStrips
+) -> tuple[tuple[Scalar, Scalar], Scalar]:
+    """Move rays of equal energies so that every strip gets its fraction of them, and weight them.
+
+    Along each axis the energy is normally distributed. The quantile at the fraction t of the rays, which is
+    that of the energy before, moves to the quantile at a fraction of the energy that is linear in t within
+    each strip.
+    """
+    width, moved = np.sqrt(0.5) * beam.radius, []
+    for x, *of_axis in zip(across, *strips):
+        t, fraction, weight = 0.5 + 0.5 * jax.lax.erf(x / width), jnp.zeros_like(x), jnp.ones_like(x)
+        for rays, start, stretch, strip_weight in zip(*of_axis):
+            is_beyond = t >= rays
+            fraction = jnp.where(is_beyond, start + (t - rays) * stretch, fraction)
+            weight = jnp.where(is_beyond, strip_weight, weight)
+        # As far out as rays lie before.
+        quantile = width * jax.lax.erf_inv(jnp.clip(2.0 * fraction - 1.0, -1.0 + 2e-7, 1.0 - 2e-7))
+        # Of an axis without spread rays, they stay to the last digit.
+        moved.append(jnp.where(jnp.all(of_axis[3] == 1.0), x, quantile))
+        energy = energy * weight
+    return (moved[0], moved[1]), energy
 
 
 def interleaving_shifts(shift: Float[Array, "2"], count: int) -> Float[Array, "lattices 2"]:
