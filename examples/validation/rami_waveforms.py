@@ -213,7 +213,7 @@ def main(argv=None):
         caption="""Apparent reflectance by height in all orders (lines) and of the first (dotted), over
         discs and over voxels. Columns for comparisons are in `rami_waveforms.csv`.""",
         unchecked="""Higher orders over discs: their sum is that of the reflectance factors above, their times
-        are jaxlidar's own. RAMI-IV asks for another wavelength. The record holds HET01 alone.""",
+        are jaxlidar's own. RAMI-IV asks for another wavelength.""",
         draw=draw,
         of_others=True,
         size=(4.0 * arguments.canopies, 7.0),
