@@ -251,10 +251,10 @@ def main(argv=None):
         title="Photons of ICESat-2 on slopes against the truth",
         caption=caption,
         unchecked="""Dead time, ground that is rough beside its slope, and footprints of another width than
-        11 m at 1/e2. Constants of the method were set on draws 0 and 1; the record is of draw 2, every
+        11 m at 1/e2. Constants of the method were set on draws 0, 1, 3 and 4; the record is of draw 2, every
         second combination. A slope across the track and low plants widen the echo alike, so that steep
-        grounds are hardly ever good. Plants of 1 to 3 m that hide nine tenths of the ground and return few
-        photons are the exception that remains: their few good grounds are 1 to 2 m too high.""",
+        grounds are hardly ever good. An echo without canopy is good only if no ground is hidden below it that
+        returns a twentieth or a tenth of the light; plants that hide more would still pass for ground.""",
         draw=draw,
         size=(9.0, 3.8),
         classes=classes,

@@ -73,9 +73,9 @@ _LEAST_EVIDENCE, _EMPTY_WEIGHT = 5.0, 1e-3
 # falls by a factor e; least spread of hat functions in m.
 _GROUND_CELL, _ECHO_WIDTHS, _WIDTH_CHANGE, _LEAST_SPREAD = 10.0, (0.3, 0.45, 0.7, 1.0), 0.5, 0.05
 # Radius (one standard deviation) of the footprint in m; what a slope that is not seen along the track costs
-# in log-likelihood for each cell, as low plants look like one; and the share of the variance of the echo that
-# is uncertain: that of 200 photons.
-_FOOTPRINT, _UNSEEN_COST, _VARIANCE_ERROR = 2.75, 10.0, 0.1
+# in log-likelihood for each cell, as low plants look like one. The share (2 / n)^1/2 of the variance of the
+# echo is uncertain, for n photons in the cells on either side, but not more than 200.
+_FOOTPRINT, _UNSEEN_COST, _WIDTH_NEIGHBOURS, _MOST_PHOTONS = 2.75, 10.0, 3, 200
 # Foot of low plants below the middle of an echo that they widen, in standard deviations that they add, for a
 # parabolic profile from the ground to D: a mean of D / 2 over a deviation of D / sqrt(20).
 _FOOT_SIGMAS = np.sqrt(5.0)
@@ -103,6 +103,11 @@ _DOUBTFUL_EXCESS = 0.5
 # Depths below the ground in which photons are counted: the least in m, steps of so many m, and their number;
 # and the segments on either side that are counted with each.
 _LEAST_DEPTH, _DEPTH_STEP, _DEPTH_STEPS, _DEPTH_NEIGHBOURS = 1.0, 1.0, 11, 2
+# A ground that dense plants hide: its shares of the light, slabs below the echo in which it may lie (from so
+# many standard deviations down, in steps of depth), segments on either side, and odds from which on the echo
+# may be that of plants.
+_HIDDEN_SHARES, _HIDDEN_SIGMAS, _HIDDEN_SLABS, _HIDDEN_NEIGHBOURS = (0.05, 0.1), 2.0, 2, 4
+_HIDDEN_ODDS = 0.5
 # Beta distributions of canopy: means and sums of their two parameters, bases over tops, and tops over the
 # percentile of the sample. Power of the top with which the prior falls, so that even canopies under sunlight
 # do not read high, and the error by other profiles (two layers) as a share of the height.
@@ -182,11 +187,11 @@ def photon_ground_and_canopy(
     photons. Light is taken to travel straight down. Slopes may be up to 20 degrees, in any direction: the
     width of the ground's echo is estimated with its height, for footprints like those of ICESat-2. A slope
     across the track and plants of 1 to 4 m widen it alike: the standard error holds both, so that most
-    grounds on more than 10 degrees are "doubtful". Plants of 1 to 3 m that hide nine tenths of the ground
-    may still be "good" and 1 to 2 m too high. Under a canopy that lets hardly any photon reach the ground,
-    the ground is the lower edge of what returns, and "doubtful" if the canopy goes on above it. Where no
-    surface is certain, a ground is "good" if background alone would hardly give as many photons anywhere
-    in the window.
+    grounds on more than 10 degrees are "doubtful". So is an echo without canopy below which a twentieth or a
+    tenth of the light may come from a ground that plants hide. Under a canopy that lets hardly any photon
+    reach the ground, the ground is the lower edge of what returns, and "doubtful" if the canopy goes on above
+    it. Where no surface is certain, a ground is "good" if background alone would hardly give as many photons
+    anywhere in the window.
 
     **Arguments:**
 
@@ -307,6 +312,15 @@ def photon_ground_and_canopy(
     below = scipy.signal.convolve2d(below.reshape(n_segments, _DEPTH_STEPS), slabs, mode="same")
     by_depth = _moving_sum(expected * lengths, _DEPTH_NEIGHBOURS) * 2.0 * _DEPTH_STEP
     is_deeper = below.max(axis=1) > scipy.stats.poisson.isf(_FALSE_DEPTH / _DEPTH_STEPS, by_depth)
+    # Without a canopy, the echo may be that of low plants, which hide the ground.
+    odds = _odds_of_hidden_ground(
+        (-above - _HIDDEN_SIGMAS * echo_width[number]) / _DEPTH_STEP,
+        number,
+        near,
+        expected * lengths,
+        ground_range,
+    )
+    is_hidden = ~has_canopy & (odds > _HIDDEN_ODDS)
     verdicts = [
         _verdict(
             bool(has_ground[i]),
@@ -316,6 +330,7 @@ def photon_ground_and_canopy(
             int(fewest_good[i]),
             bool(is_deeper[i]),
             bool(excess[i] > _DOUBTFUL_EXCESS),
+            bool(is_hidden[i]),
         )
         for i in range(n_segments)
     ]
@@ -590,12 +605,19 @@ def _ground_curve(photons: _Photons, surface: _Curve, background: _Background) -
         mean = posterior @ offsets
         stderr = np.sqrt(np.maximum(posterior @ offsets**2 - mean**2, 0.0))
         height = curve.z + mean
-    variance = stderr**2 + _ambiguity(mean, width, along[:, 0], _posterior(evidence, offsets), offsets)
+    is_near = np.abs(photons.z - height[number]) <= _RANGE_SIGMAS * width[number]
+    count = _moving_sum(np.bincount(number[is_near], minlength=middle.size), _WIDTH_NEIGHBOURS)
+    variance = stderr**2 + _ambiguity(mean, width, along[:, 0], count, _posterior(evidence, offsets), offsets)
     return curve._replace(z=height, stderr=np.sqrt(variance), width=width)
 
 
 def _ambiguity(
-    mean: np.ndarray, width: np.ndarray, along: np.ndarray, wide: np.ndarray, offsets: np.ndarray
+    mean: np.ndarray,
+    width: np.ndarray,
+    along: np.ndarray,
+    count: np.ndarray,
+    wide: np.ndarray,
+    offsets: np.ndarray,
 ) -> np.ndarray:
     """Return the mean square error in m^2 by slopes across the track and low plants that look alike.
 
@@ -603,11 +625,13 @@ def _ambiguity(
     does not explain may be that of plants, with the ground at their foot. Each is so in half of all cases.
 
     **Arguments:** `mean`, `width`: (cells,) m, offset of the ground and width of its echo. `along`: slopes
-    along the track. `wide`: (cells, widths, offsets) probabilities without a cost of slopes across it.
+    along the track. `count`: photons that tell the width. `wide`: (cells, widths, offsets) probabilities
+    without a cost of slopes across it.
     """
     widest = np.maximum(width**2, wide.sum(axis=2) @ np.square(_ECHO_WIDTHS))
     explained = _ECHO_WIDTHS[0] ** 2 + (_FOOTPRINT * along) ** 2
-    added = np.maximum(widest - explained, 0.0) + _VARIANCE_ERROR * widest
+    variance_error = np.sqrt(2.0 / np.clip(count, 2.0, _MOST_PHOTONS))
+    added = np.maximum(widest - explained, 0.0) + variance_error * widest
     return 0.5 * (wide.sum(axis=1) @ offsets - mean) ** 2 + 0.5 * _FOOT_SIGMAS**2 * added
 
 
@@ -707,6 +731,34 @@ def _posterior(evidence: np.ndarray, offsets: np.ndarray) -> np.ndarray:
     return posterior / posterior.sum(axis=(1, 2), keepdims=True)
 
 
+def _odds_of_hidden_ground(
+    steps: np.ndarray, number: np.ndarray, near: np.ndarray, background: np.ndarray, ground_range: np.ndarray
+) -> np.ndarray:
+    """Return the odds for each segment that its echo is that of plants, and that the ground lies below.
+
+    Below plants of N photons, a ground with the share p of the light returns h = N p / (1 - p) of them. Where
+    n are found and b are expected without it, the ratio of the Poisson likelihoods is (1 + h / b)^n exp(-h).
+    Its mean over shares and depths is the odds, if both cases are as likely before.
+
+    **Arguments:** `steps`: (photons,) below the echo, in steps of depth; `number`: of their segments. `near`:
+    (segments,) photons in the echo. `background`: (segments,) per m of height. `ground_range`: (segments,) m,
+    half the height of the echo.
+    """
+    background = _moving_sum(background, _HIDDEN_NEIGHBOURS)
+    echo = np.maximum(_moving_sum(near, _HIDDEN_NEIGHBOURS) - background * 2.0 * ground_range, 0.0)
+    ratios = []
+    for k in range(_HIDDEN_SLABS):
+        # Slabs of two steps. The first also has the tail of the echo.
+        is_in_slab = (steps >= k) & (steps < k + 2)
+        count = _moving_sum(np.bincount(number[is_in_slab], minlength=near.size), _HIDDEN_NEIGHBOURS)
+        by_echo = echo * scipy.special.ndtr(-_HIDDEN_SIGMAS) if k == 0 else 0.0
+        without = background * 2.0 * _DEPTH_STEP + by_echo
+        for share in _HIDDEN_SHARES:
+            hidden = echo * share / (1.0 - share)
+            ratios.append(count * np.log1p(hidden / without) - hidden)
+    return np.exp(scipy.special.logsumexp(ratios, axis=0) - np.log(len(ratios)))
+
+
 def _rare_count(expected: np.ndarray, places: np.ndarray | float) -> np.ndarray:
     """Return the smallest count that background reaches at any of `places` places only by `_FALSE_GOOD`."""
     probability = np.minimum(_FALSE_GOOD / np.maximum(places, 1.0), 1.0)
@@ -721,6 +773,7 @@ def _verdict(
     fewest_good: int,
     is_deeper: bool,
     has_excess: bool,
+    is_hidden: bool,
 ) -> Verdict:
     """Return the verdict on the ground of a segment."""
     if not has_ground:
@@ -735,6 +788,8 @@ def _verdict(
         verdict &= Verdict("doubtful", (reason,))
     if is_deeper:
         verdict &= Verdict("doubtful", ("photons below the ground",))
+    if is_hidden:
+        verdict &= Verdict("doubtful", ("the echo may be that of low plants, with little light from below",))
     if has_excess:
         verdict &= Verdict("doubtful", ("the ground may be a part of the canopy, which goes on above it",))
     return verdict

@@ -21,17 +21,17 @@ SHOTS = 286
 DISTANCE = 0.7 * np.arange(SHOTS)
 
 
-def track(slope, ground=2.0, canopy=2.0, footprint=0.0):
+def track(slope, ground=2.0, canopy=2.0, footprint=0.0, base=BASE, top=TOP):
     """Waveforms along 200 m, as far as `record` reads them, of sloping ground and a canopy.
 
     `slope`: degrees. `ground`, `canopy`: mean number of photons of each per pulse. `footprint`: radius in m
-    (one standard deviation) over which a slope spreads the ground's echo.
+    (one standard deviation) over which a slope spreads the ground's echo. `base`, `top`: of the canopy, m.
     """
     height = np.arange(60.0, -30.0, -0.1)
     above = height - GROUND - np.tan(np.deg2rad(slope)) * (DISTANCE[:, None] - 100.0)
     width = np.hypot(0.15, footprint * np.tan(np.deg2rad(slope)))
     echo = np.exp(-0.5 * (above / width) ** 2)
-    layer = ((above > BASE) & (above < TOP)).astype(float)
+    layer = ((above > base) & (above < top)).astype(float)
     targets = ((ground, echo), (canopy, layer))
     photons = sum(n * shape / shape.sum(axis=1, keepdims=True) for n, shape in targets)
     return SimpleNamespace(
@@ -108,6 +108,24 @@ def test_a_bare_slope_has_no_canopy_and_its_ground_is_the_middle_of_the_echo(slo
     error, canopies, _ = error_and_canopies()
     assert np.median(error) > 0.5
     assert canopies > 0.3
+
+
+def test_low_plants_that_hide_their_ground_are_doubtful(monkeypatch):
+    """Plants of 1.1 to 1.7 m above a ground that returns a tenth of the light, by night and by day."""
+    plants, bare = track(0.0, 0.1, 0.9, base=1.1, top=1.7), track(0.0, 1.0, 0.0)
+
+    def errors_of_good_ones(wave):
+        errors = []
+        for rate in (1e5, 1e6):
+            heights = inversion.photon_ground_and_canopy(events_of(wave, rate), DISTANCE)
+            errors.append((heights.ground - GROUND)[heights.quality == "good"])
+        return np.concatenate(errors)
+
+    assert np.all(np.abs(errors_of_good_ones(plants)) < 1.0)
+    assert errors_of_good_ones(bare).size >= 18
+    # Negative control.
+    monkeypatch.setattr(photons, "_HIDDEN_ODDS", np.inf)
+    assert np.mean(errors_of_good_ones(plants) > 1.0) > 0.5
 
 
 def test_the_background_is_estimated_from_the_record():
@@ -335,4 +353,8 @@ def test_without_the_number_of_places_a_ground_far_off_is_good(monkeypatch):
     monkeypatch.setattr(photons, "_FALSE_GROUND", 0.05)
     assert np.all(np.abs(errors_of_good_ones("background alone", 20)) < 2.0)
     monkeypatch.setattr(photons, "_FALSE_GOOD", np.inf)
+    # Two other rules are off: background below such a ground may be light from a deeper one, and so few
+    # photons do not tell the width of an echo.
+    monkeypatch.setattr(photons, "_HIDDEN_ODDS", np.inf)
+    monkeypatch.setattr(photons, "_FOOT_SIGMAS", 0.0)
     assert np.any(np.abs(errors_of_good_ones("background alone", 20)) > 20.0)
