@@ -22,8 +22,8 @@ lattice of eight times as many rays, which has no gaps. If a lattice of N rays h
 all eight is c (8 N)^-a. It is 8^(1/2 - a) times what their scatter tells, the standard error of the mean of
 eight independent ones. Seen from straight above, returns jump at the edges of columns: a = 3/4. A slant beam
 enters voxels by their sides as well, so that returns bend where they would jump: a = 0.85, found by trial.
-Beams straight down have rays in every column that they graze, with weights by the exact share of its energy
-(`trace.first.lattices_of_shots.strips_of_columns`), so that no error stays unseen for want of rays.
+Round Gaussian beams straight down have rays in every column that they graze, weighted by its share of the
+energy (`trace.first.lattices_of_shots.strips_of_columns`), so that no error stays unseen for want of rays.
 `examples/validation/standard_errors.py` compares the errors that follow with the scatter of many keys. Shots
 that are not within the tolerance get more parts, as many as the error of each asks for.
 """
@@ -565,7 +565,9 @@ def trace_together(
 
     def strips_of(shot: ShotGeometry, beam: Beam, aim: Array, n_parts: Array) -> FootprintStrips:
         is_straight_down = ~is_slant(scene, shot.zenith) & (beam.axis[2] < 0.0)
-        n_rays, is_spread = n_parts * RAYS_OF_PART * MIN_BATCHES, is_straight_down & beam.gaussian
+        # Along the axes of the map, other footprints are not normally distributed, or not independently.
+        is_spread = is_straight_down & (beam.gaussian and beam.ellipse is None)
+        n_rays = n_parts * RAYS_OF_PART * MIN_BATCHES
         return strips_of_columns(scene_of_first, beam, aim, n_rays, MIN_BATCHES, is_spread)
 
     strips = jax.vmap(strips_of)(shots, beams, aims, n_parts)
