@@ -68,7 +68,7 @@ class Terrain(AbstractGround):
     slopes hide other slopes from the sensor. Heights that lie in a plane are traced as an infinite plane; for
     derivatives with respect to such heights, make the plan with effects={"relief": True}. In scattering of
     order two and above, derivatives with respect to heights leave out that slopes begin or cease to hide one
-    another.
+    another; cells are saddles, which may hide their own diagonals.
 
     **Arguments:**
 

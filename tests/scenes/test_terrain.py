@@ -265,9 +265,9 @@ def test_black_terrain():
 
 # -- derivatives -------------------------------------------------------------------------------------------
 
-BOWL = 0.08 * ((X - 10.0) ** 2 + (Y - 8.0) ** 2)
+BOWL = 0.2 * ((X - 10.0) ** 2 + (Y - 8.0) ** 2)
 NODE = np.zeros_like(BOWL)
-NODE[10, 8] = -1.0
+NODE[10, 8] = 1.0
 
 
 @pytest.mark.parametrize(
@@ -281,7 +281,8 @@ def test_derivatives_with_respect_to_heights(zenith, orders, photons, keys, heig
     """Derivatives in the amplitude of the relief, in one node and in the reflectance of a strip.
 
     They are compared with central differences over independent keys. In higher orders, derivatives leave out
-    that slopes begin or cease to hide one another: in the bowl none does.
+    that slopes begin or cease to hide one another: in the bowl none does. Its node is raised: about a lowered
+    one, cells are saddles that hide their own diagonals.
     """
     lidar = jl.Lidar(divergence=2.0, pulse=jl.GaussianPulse(fwhm=3.0), zenith=zenith, azimuth=40.0)
     start = {"relief": jnp.asarray(1.0), "node": jnp.asarray(0.1), "strip": jnp.asarray(0.3)}
