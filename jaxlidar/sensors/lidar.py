@@ -134,8 +134,10 @@ class Lidar(eqx.Module):
       for small angles. For a Gaussian beam it is measured between the directions at 1/e^2 of the axial
       irradiance, for a top-hat across the disc. Default 0.3.
     - `level_divergence`: that across the vertical plane of the beam, mrad, in (0, 300], of an elliptical
-      Gaussian beam; `divergence` is then that within this plane. A line scanner has it along the scan, a
-      terrestrial one across the level. Default None: as `divergence`, a round beam.
+      Gaussian beam; `divergence` is then that within this plane, which is that of `azimuth` for a beam
+      straight down. On a level platform, a line scanner has `divergence` along the scan; with pitch, and
+      straight down, the ellipse turns with the azimuths of the beams. Default None: as `divergence`, a round
+      beam.
     - `aperture`: diameter of the receiver in m, positive. Default 0.2.
     - `zenith`: angle between the beam and straight down (nadir) in degrees, in [0, 89]; with `sensor` in
       [0, 180], where 90 is level and 180 straight up. Default 0.

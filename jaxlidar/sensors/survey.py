@@ -618,6 +618,11 @@ class Survey(eqx.Module):
                     f"{field} is None; admissible is that of a line, or a lidar that stands still, "
                     "lidar.at(...)"
                 )
+        if isinstance(pattern, Panorama):
+            raise ValueError(
+                "pattern is a Panorama, but lidar has an altitude and flies; admissible is a lidar that "
+                "stands still, lidar.at(...), or another pattern"
+            )
         first, forward, _, length = _line(start, end)
         check_number("speed", speed, 0.0, low_open=True)
         check_number("pulse_rate", pulse_rate, 0.0, low_open=True)
@@ -708,10 +713,10 @@ class Survey(eqx.Module):
         if pulse_rate is not None:
             check_number("pulse_rate", pulse_rate, 0.0, low_open=True)
             warn_unit("pulse_rate", pulse_rate, _PULSE_RATE)
-        channels: Any = [mounting]
-        if isinstance(mounting, Sequence | np.ndarray) and len(mounting):
-            channels = mounting if all(np.ndim(row) == 1 for row in mounting) else channels
-        turns = [rotation_matrix(*three_numbers("mounting", row)) for row in channels]
+        angles = as_numpy(mounting, "mounting")
+        if angles.ndim not in (1, 2) or angles.shape[-1] != 3 or angles.size == 0:
+            raise ValueError(f"mounting has shape {angles.shape}; admissible is (3,) or (channels, 3)")
+        turns = [rotation_matrix(*three_numbers("mounting", row)) for row in np.atleast_2d(angles)]
         arm = three_numbers("lever_arm", lever_arm)
         durations = [float(strip.time[-1] - strip.time[0]) for strip in strips]
         if pulse_rate is not None:

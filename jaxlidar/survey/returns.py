@@ -114,6 +114,8 @@ _FULL_INTENSITY = 65535
 _ORDERS = ("first", "higher")
 # Materials of plants: of voxels, and of the triangles of `leaf_mesh` and `mesh_of`.
 _PLANTS = ("leaf", "bark", "mesh:leaf", "mesh:wood")
+# Returns of surfaces of which no ray meets the surface: a larger part than this one is warned of.
+_LARGEST_MISS = 0.1
 # Materials of the parts of `DiscreteReturns.part`, by its numbers.
 _PARTS = (("air", _NO_MATERIAL), ("ground",), ("leaf", "mesh:leaf"), ("bark", "mesh:wood"))
 
@@ -228,6 +230,9 @@ class DiscreteReturns(eqx.Module):
 
         **Returns:** a `DiscreteReturns` with `instance`, `normal` and `incidence`.
 
+        **Warns:** UserWarning where more than a tenth of the returns of surfaces find none, as with another
+        survey or scene.
+
         **Raises:** ValueError for another number of shots than that of the returns; TypeError for objects of
         the wrong type, such as `SceneParts`.
 
@@ -253,6 +258,13 @@ class DiscreteReturns(eqx.Module):
         error = np.zeros(self.n_shots) if survey.stated is None else survey.stated[:, 5]
         true_range = self.range - error[self.shot]
         labels = labels_of(self.shot, true_range, self.width, self.material, survey, scene)
+        is_surface = (self.part > 0) & ~np.isin(self.material, ("leaf", "bark"))
+        n_surfaces, n_missed = np.sum(is_surface), np.sum(is_surface & np.isnan(labels.incidence))
+        if n_missed > _LARGEST_MISS * n_surfaces:
+            warn_user(
+                f"{n_missed} of {n_surfaces} returns of surfaces lie where no ray meets one, and have no "
+                "label: survey and scene must be those that were simulated, disturbed as they were"
+            )
         return dataclasses.replace(self, **labels._asdict())
 
     @property

@@ -203,3 +203,10 @@ TRIPOD = jl.Lidar(sensor=(0, 0, 1.7))
 def test_inadmissible_patterns_are_refused(make, error, message):
     with pytest.raises(error, match=message):
         make()
+
+
+def test_a_panorama_does_not_fly():
+    """Its lines are those of a scanner that stands still: pulses of another rate would miss some."""
+    line = {"start": (0, 0), "end": (0, 5), "speed": 1.0, "pulse_rate": 100.0}
+    with pytest.raises(ValueError, match="pattern is a Panorama, but lidar has an altitude"):
+        jl.Survey.scan(jl.Lidar(), jl.Panorama(zenith=(0, 60), step=30), **line)

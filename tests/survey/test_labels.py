@@ -232,7 +232,8 @@ def test_a_twig_that_fills_little_of_a_footprint_has_its_label():
     returns = labelled(survey, scene, ["mesh:panel", "ground"], [24.0, 30.0], [0, 0])
     assert returns.instance.tolist() == [5, 0]
     # What lies farther from a return than it is wide has no part in it.
-    returns = labelled(survey, scene, ["mesh:panel", "ground"], [23.8, 30.0], [0, 0])
+    with pytest.warns(UserWarning, match="1 of 2 returns of surfaces lie where no ray meets one"):
+        returns = labelled(survey, scene, ["mesh:panel", "ground"], [23.8, 30.0], [0, 0])
     assert returns.instance.tolist() == [0, 0]
     assert np.isnan(returns.incidence).tolist() == [True, False]
 
@@ -257,7 +258,8 @@ def test_labels_are_those_of_the_true_beams():
     assert np.abs(true.stated[:, 5]).min() > 0.16
     assert returns.instance.tolist() == [1, 1]
     np.testing.assert_allclose(returns.normal, np.tile([0.0995, 0, 0.995], (2, 1)), atol=1e-3)
-    assert labelled(strip, scene, "mesh:panel", distance).instance.tolist() == [0, 0]
+    with pytest.warns(UserWarning, match="2 of 2 returns of surfaces"):
+        assert labelled(strip, scene, "mesh:panel", distance).instance.tolist() == [0, 0]
 
 
 def test_voxels_and_air_have_no_surface():
@@ -338,3 +340,15 @@ RETURNS = labelled(downwards([(0, 0)]), jl.Scene(ground=GROUND), "ground", [30.0
 def test_inadmissible_input_is_refused(make, error, message):
     with pytest.raises(error, match=message):
         make()
+
+
+def test_another_survey_or_scene_is_warned_of():
+    """Returns whose surfaces are not met are counted; those of the survey itself are all met."""
+    survey = jl.Survey.grid(jl.Lidar(altitude=300.0, **SHARP), (-4, 0), (4, 0), 2.0)
+    scene = jl.Scene(meshes=[panel((0.0, 0.0, 4.0), (0, 0, 1), size=4.5)], ground=GROUND)
+    true = survey.disturbed(range=3.0, key=jax.random.key(1))
+    returns = jl.simulate_many(true, scene, key=jax.random.key(0), max_orders=1, rtol=0.05).returns()
+    assert np.isfinite(returns.labelled(true, scene).incidence).all()
+    for other in ((survey, scene), (true, jl.Scene(ground=jl.Ground(height=-50.0)))):
+        with pytest.warns(UserWarning, match="5 returns of surfaces lie where no ray meets one"):
+            returns.labelled(*other)
