@@ -21,7 +21,14 @@ ORDER = (
     *("mitransient_crown", "mitransient_meshes", "mcx_crown", "multiscatter_slabs"),
     *("standard_errors", "leaf_databases", "recorded_gedi", "recorded_posterior"),
     *("recorded_neon", "recorded_riegl"),
-    *("recorded_flat", "recorded_lvis", "recorded_clouds", "photons_on_slopes", "recorded_photons"),
+    *(
+        "recorded_flat",
+        "recorded_lvis",
+        "recorded_clouds",
+        "recorded_footprints",
+        "photons_on_slopes",
+        "recorded_photons",
+    ),
 )
 
 HEAD = """# Validation: comparisons with references, and their differences

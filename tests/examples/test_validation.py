@@ -366,6 +366,39 @@ def test_airborne_clouds(run, shared):
 
 
 @pytest.mark.slow
+# The clouds are on NAD83.
+@pytest.mark.filterwarnings("ignore:crs. the accuracy of the transformation")
+@pytest.mark.parametrize("name", ["megaplot", "mixedconifer", "topography"])
+def test_footprints_over_airborne_clouds(run, shared, name):
+    """Metrics of the GEDI simulator over its clouds; with a pulse three times as long, other waveforms."""
+    files = shared / "als" / "gedi_simulator.npz", shared / "als" / f"{name}.laz"
+    rows = run("recorded_footprints", *files)["rows"]
+
+    def value(what, metric):
+        (row,) = (r for r in rows if r["what"].startswith(what) and r["case"].startswith(f"{metric}, "))
+        return row["here"]
+
+    assert holds({"rows": rows}, "correlation of waveforms")
+    # Below the gap between crowns and ground, where little energy is, percentiles are ill-defined.
+    largest = 0.5 if name == "mixedconifer" else 0.3
+    for percent in (50, 75, 90, 95, 98):
+        assert abs(value("median", f"rhReal {percent}")) < largest
+        assert value("correlation", f"rhReal {percent}") > 0.97
+        for metric, bound in (("rhMax", 0.4), ("rhInfl", 0.4), ("rhGauss", 0.5)):
+            assert abs(value("median", f"{metric} {percent}")) < bound
+    for metric, bound in (("FHD", 0.05), ("maxHalfCov", 0.05), ("signal top", 0.3)):
+        assert abs(value("median", metric)) < bound
+        assert value("correlation", metric) > 0.85
+    assert abs(value("median", "ALS cover")) < 0.05
+
+    def plant(module):
+        module.PULSE = 3.0
+
+    planted = run("recorded_footprints", *files, planted=plant)
+    assert not holds(planted, "correlation of waveforms")
+
+
+@pytest.mark.slow
 def test_recorded_photons_of_icesat2(run, shared):
     """The ground holds by its errors; not that of a track that is 2 m too high."""
     paths = [shared / "icesat2" / name for name in ("atl03_half.h5", "atl08_half.h5")]

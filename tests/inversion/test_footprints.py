@@ -4,7 +4,6 @@ import jax
 import numpy as np
 import pytest
 
-import inversion
 import jaxlidar as jl
 from inversion import commands, footprints
 from inversion.metrics.gedi_simulator import link_margin_noise
@@ -12,7 +11,6 @@ from jaxlidar.cli.constants import INTERRUPTED, SUCCESS
 from jaxlidar.formats.footprints import read_places
 from jaxlidar.io import read_gedi_l1b, write_gedi_l1b, write_las
 from tests.fuzz.fuzz_changes import change_text
-from tests.inversion.metrics.test_gedi_simulator import FOOTPRINT, PULSE, reference_of, shot_of
 
 pytest.importorskip("laspy")
 pytest.importorskip("h5netcdf")
@@ -246,57 +244,3 @@ def test_a_scheduler_of_dask_needs_dask(tmp_path, cloud, monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "distributed", None)
     with pytest.raises(ImportError, match=r"jaxlidar\[cluster\]"):
         run(tmp_path, cloud, "--workers", "tcp://127.0.0.1:1")
-
-
-# -- the GEDI simulator ------------------------------------------------------------------------------------
-
-
-@pytest.mark.slow
-# The clouds are on NAD83.
-@pytest.mark.filterwarnings("ignore:crs. the accuracy of the transformation")
-@pytest.mark.parametrize("name", ["megaplot", "mixedconifer", "topography"])
-def test_metrics_are_those_of_the_gedi_simulator(shared, tmp_path, name):
-    """Over its clouds, from files to metrics; where none are stored, those of its records."""
-    height, stored = reference_of(shared, name)
-    rows = "\n".join(f"{x},{y}" for x, y in zip(stored["x"], stored["y"]))
-    (tmp_path / "places.csv").write_text(f"x,y\n{rows}\n")
-    fwhm = PULSE * np.sqrt(8.0 * np.log(2.0)) / (0.5 * jl.SPEED_OF_LIGHT)
-    lidar = jl.Lidar(altitude=4e5, divergence=4e3 * FOOTPRINT / 4e5, pulse=jl.GaussianPulse(fwhm))
-    table = footprints.simulate_footprints(
-        [shared / "als" / f"{name}.laz"],
-        tmp_path / "places.csv",
-        tmp_path / "l1b.h5",
-        tmp_path / "tiles",
-        lidar=lidar,
-    )
-    expected = inversion.metrics.gedi_simulator.simulator_table(
-        [shot_of(z, y, i) for i, (z, y) in enumerate(zip(height, stored["count"].astype(float)))], FOOTPRINT
-    )
-    shots = {shot.shot_number: shot for shot in read_gedi_l1b(tmp_path / "l1b.h5")}
-    correlation = [
-        np.corrcoef(np.interp(-z, -shots[i + 1].elevation, shots[i + 1].signal), record)[0, 1]
-        for i, (z, record) in enumerate(zip(height, stored["count"]))
-    ]
-    assert np.median(correlation) > 0.99
-    has_ground = np.isfinite(table["true ground"]) & (stored["true_ground"] > -1e3)
-
-    def compare(ours, theirs):
-        """Return the median difference and the correlation over the footprints."""
-        rows = np.isfinite(ours) & np.isfinite(theirs) & has_ground
-        return np.median(ours[rows] - theirs[rows]), np.corrcoef(ours[rows], theirs[rows])[0, 1]
-
-    # Below the gap between crowns and ground, where little energy is, percentiles are ill-defined.
-    largest = 0.5 if name == "mixedconifer" else 0.3
-    for percent in (50, 75, 90, 95, 98):
-        difference, correlated = compare(table["rhReal"][:, percent], stored["rh_real"][:, percent])
-        assert abs(difference) < largest
-        assert correlated > 0.97
-        for metric in ("rhMax", "rhInfl"):
-            difference, _ = compare(table[metric][:, percent], expected[metric][:, percent])
-            assert abs(difference) < 0.4
-        assert abs(compare(table["rhGauss"][:, percent], stored["rh_gauss"][:, percent])[0]) < 0.5
-    for metric, bound in (("FHD", 0.05), ("maxHalfCov", 0.05), ("signal top", 0.3)):
-        difference, correlated = compare(table[metric], expected[metric])
-        assert abs(difference) < bound
-        assert correlated > 0.85
-    assert abs(compare(table["ALS cover"], stored["als_cover"])[0]) < 0.05
