@@ -142,7 +142,7 @@ def test_the_reference_builds_without_a_warning_and_its_links_have_targets(tmp_p
     assert "HenyeyGreenstein" in main_page
     assert "Surveys of many shots" in main_page
     web_pages = list(tmp_path.rglob("*.html"))
-    for name in ("inversion", "jaxlidar/io", "jaxlidar/plot", "pages/jaxlidar", "pages/jaxlidar_io"):
+    for name in ("inversion", "jaxlidar/io", "jaxlidar/plot", "pages/jaxlidar", "pages/jaxlidar_formats"):
         assert tmp_path / f"{name}.html" in web_pages
     for page in web_pages:
         links = re.findall(r'(?:href|src)="([^"#:]+\.(?:html|png))(?:#([^"]+))?"', page.read_text())

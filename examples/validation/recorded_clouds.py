@@ -3,7 +3,8 @@
     python examples/validation/recorded_clouds.py NPZ LAZ... [--out figures]
 
 NPZ has waveforms that the GEDI simulator (Hancock et al. 2019) made of the clouds LAZ, by the name of each:
-`x, y`, heights of the first and the last sample, `count`, and `ground_count` where ground is classified. Each
+`x, y`, heights of the upper end of the first sample and the lower end of the last one, `count`, and
+`ground_count` where ground is classified. Each
 cloud becomes a canopy and a terrain (`jaxlidar.canopy_from_points`), over which the same footprints are
 simulated, with leaves as bright as the ground. Beside them stands the plain sum of points: every return has
 the weight of a Gaussian footprint over the density of last returns, without any scene.
@@ -33,6 +34,13 @@ def lidar():
     fwhm = PULSE * np.sqrt(8.0 * np.log(2.0)) / (0.5 * jl.SPEED_OF_LIGHT)
     pulse = jl.GaussianPulse(fwhm=fwhm)
     return jl.Lidar(altitude=ALTITUDE, divergence=4e3 * FOOTPRINT / ALTITUDE, pulse=pulse)
+
+
+def middles_of_samples(reference):
+    """Return heights of the middles of samples, (footprints, samples); the simulator names their tops."""
+    samples = reference["count"].shape[1]
+    first, last = (reference[end].astype(float)[:, None] for end in ("z_first", "z_last"))
+    return first + (last - first) * (np.arange(samples) + 0.5) / samples
 
 
 def sums_of_points(points, place, height):
@@ -115,8 +123,7 @@ def main(argv=None):
         prefix = f"{name}/"
         reference = {k.removeprefix(prefix): stored[k] for k in stored.files if k.startswith(prefix)}
         place = np.column_stack([reference["x"], reference["y"]])
-        samples = reference["count"].shape[1]
-        height = np.linspace(reference["z_first"], reference["z_last"], samples, axis=1)
+        height = middles_of_samples(reference)
         results = {
             "simulated": simulations(points, place, height, jax.random.key(number)),
             "sum of points": sums_of_points(points, place, height),

@@ -13,14 +13,13 @@ from pathlib import Path
 
 import numpy as np
 from _validation import COLOURS, comparison, finish, number, options, with_progress
+from recorded_clouds import FOOTPRINT, PULSE, lidar, middles_of_samples
 
 import jaxlidar as jl
 from inversion.footprints import simulate_footprints
 from inversion.metrics.gedi_simulator import simulator_table
 from jaxlidar.io import GediShot, read_gedi_l1b
 
-# Standard deviations of footprint and pulse, m.
-FOOTPRINT, PULSE, ALTITUDE = 5.5, 0.95485, 4e5
 # Percentiles of relative heights, by metric; metrics that are one number, with their unit.
 PERCENTS = (25, 50, 75, 90, 95, 98)
 HEIGHTS = ("rhReal", "rhMax", "rhInfl", "rhGauss")
@@ -34,16 +33,14 @@ def reference_of(npz, name):
     """Return the heights of samples, and the stored values of a cloud by name."""
     stored = np.load(npz)
     values = {key.removeprefix(f"{name}/"): stored[key] for key in stored.files if key.startswith(f"{name}/")}
-    # The lower end of the record is that of its last sample.
-    first, last = (values[end].astype(float) for end in ("z_first", "z_last"))
-    return np.linspace(first, last, values["count"].shape[1], endpoint=False, axis=1), values
+    return middles_of_samples(values), values
 
 
 def shot_of(height, record, number):
     """Return a shot of a record without noise, with the reference's pulse."""
     lag = np.arange(-40.0, 41.0)
     power = np.exp(-0.5 * (0.5 * jl.SPEED_OF_LIGHT * lag / PULSE) ** 2)
-    place = {"latitude": 0.0, "longitude": 0.0, "altitude": ALTITUDE, "zenith": 0.0, "azimuth": 0.0}
+    place = {"latitude": 0.0, "longitude": 0.0, "altitude": 4e5, "zenith": 0.0, "azimuth": 0.0}
     received = {"waveform": record, "noise_mean": 0.0, "noise_std": 3.0}
     pulse = {"pulse_time": lag, "pulse_power": power}
     return GediShot("BEAM0101", number, np.arange(float(height.size)), height, **received, **pulse, **place)
@@ -51,15 +48,12 @@ def shot_of(height, record, number):
 
 def footprints_of(path, stored):
     """Return the table of the footprints over a cloud, and their shots in its order."""
-    fwhm = PULSE * np.sqrt(8.0 * np.log(2.0)) / (0.5 * jl.SPEED_OF_LIGHT)
-    pulse = jl.GaussianPulse(fwhm)
-    lidar = jl.Lidar(altitude=ALTITUDE, divergence=4e3 * FOOTPRINT / ALTITUDE, pulse=pulse)
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         places = "\n".join(f"{x},{y}" for x, y in zip(stored["x"], stored["y"]))
         (folder / "places.csv").write_text(f"x,y\n{places}\n")
         table = simulate_footprints(
-            [path], folder / "places.csv", folder / "l1b.h5", folder / "tiles", lidar=lidar
+            [path], folder / "places.csv", folder / "l1b.h5", folder / "tiles", lidar=lidar()
         )
         shots = {shot.shot_number: shot for shot in read_gedi_l1b(folder / "l1b.h5")}
     return table, [shots[i + 1] for i in range(len(table))]

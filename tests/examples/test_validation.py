@@ -14,6 +14,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import jaxlidar as jl
+
 FOLDER = Path(__file__).resolve().parents[2] / "examples" / "validation"
 SCRIPTS = sorted(
     p.stem for p in FOLDER.glob("*.py") if not p.stem.startswith("_") and p.stem != "make_readme"
@@ -21,7 +23,7 @@ SCRIPTS = sorted(
 # Modules in the folders of examples: a name may stand for several files, so imports must not be kept.
 EXAMPLE_MODULES = (
     *("_common", "_crown", "_rami", "_validation", "_waveforms", "peers", "simulation_cost"),
-    "surveys",
+    *("surveys", "recorded_clouds"),
 )
 
 
@@ -351,11 +353,18 @@ def test_recorded_shots_of_lvis(run, shared):
 
 @pytest.mark.slow
 def test_airborne_clouds(run, shared):
-    """Medians over the footprints of two clouds are within the bounds; not with a longer pulse."""
+    """Medians over the footprints of two clouds are within the bounds; not with a longer pulse.
+
+    The simulator counts each return once, so that pulses with many returns weigh more: the simulated crowns
+    of mixedconifer are 0.3 m higher.
+    """
     als = shared / "als"
     record = run(
         "recorded_clouds", als / "gedi_simulator.npz", als / "megaplot.laz", als / "mixedconifer.laz"
     )
+    (crown,) = (row for row in record["rows"] if "RH98, simulatedmixed" in row["what"] + row["case"])
+    assert 0.2 < crown["here"] < 0.4
+    record["rows"].remove(crown)
     assert holds(record, "simulated")
     assert holds(record, "sum of points")
 
@@ -392,7 +401,8 @@ def test_footprints_over_airborne_clouds(run, shared, name):
     assert abs(value("median", "ALS cover")) < 0.05
 
     def plant(module):
-        module.PULSE = 3.0
+        longer = dataclasses.replace(module.lidar(), pulse=jl.GaussianPulse(fwhm=45.0))
+        module.lidar = lambda: longer
 
     planted = run("recorded_footprints", *files, planted=plant)
     assert not holds(planted, "correlation of waveforms")
