@@ -18,6 +18,7 @@ import numpy as np
 import jaxlidar as jl
 from inversion.metrics.gedi_simulator import link_margin_noise, simulator_table, true_metrics
 from inversion.metrics.gedi_table import gedi_table
+from jaxlidar.extend import check_number
 from jaxlidar.formats.footprints import Places, read_places
 from jaxlidar.formats.gedi import BEAMS
 from jaxlidar.formats.tables import ColumnAxis
@@ -80,6 +81,10 @@ def simulate_footprints(
     **Raises:** as `read_places`, `jaxlidar.simulate_tiles` and `write_gedi_l1b`; ValueError for files without
     a coordinate reference system.
     """
+    if link_margin is not None:
+        check_number("link_margin", link_margin)
+    check_number("cover", cover, 0.0, 1.0, high_open=True)
+    check_number("geolocation_error", geolocation_error, 0.0)
     # Systems that differ are refused by `simulate_tiles`.
     system = next((c for c in (crs, *(CloudFile.of(path).crs for path in files)) if c is not None), None)
     if system is None:

@@ -71,7 +71,7 @@ def existing_file(path: str | os.PathLike[str]) -> Path:
     """Return the path of a file that exists. **Raises:** FileNotFoundError."""
     path = Path(path)
     if not path.is_file():
-        raise FileNotFoundError(f"{path}: no such file")
+        raise FileNotFoundError(f"{path}: {'a folder, not a file' if path.is_dir() else 'no such file'}")
     return path
 
 

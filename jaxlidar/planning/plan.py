@@ -82,6 +82,9 @@ from jaxlidar.sensors.survey import Survey
 DEFAULT_RTOL = 0.01
 # Fewer batches give no trustworthy standard error.
 MIN_BATCHES = 8
+# Least sizes of a plan with room (`Plan.with_room`). 1536 bins are 500 ns of three bins each.
+_ROOM_FOR_ORDERS, _ROOM_FOR_SEGMENTS, _ROOM_FOR_FACES = 32, 32, 64
+_ROOM_FOR_BINS, _ROOM_FOR_SPAN = 1536, 16
 # Local estimates (next-event estimation) per free flight through a canopy: points from which light returns to
 # the sensor.
 DEPOSITS_PER_FLIGHT = 4
@@ -231,6 +234,30 @@ class Plan(eqx.Module):
         """Return the plan with other path limits."""
         return dataclasses.replace(self, limits=dataclasses.replace(self.limits, **changes))
 
+    def with_room(self) -> "Plan":
+        """Return the plan with more room, where optics are applied while light is traced.
+
+        Responses are small then, and loops end when all of their photons have: time hardly depends on sizes,
+        and most changes of a scene compile nothing. Nor is a beam at nadir a program of its own, which would
+        save a tenth of the time, a third in tall canopies. For values alone, as reverse mode keeps what every
+        step of a loop leaves.
+        """
+        if self.config.keeps_histories:
+            return self
+        config, bins = self.config, self.bins
+        roomy = dataclasses.replace(
+            config,
+            vertical=False,
+            order_steps=size_bucket(max(config.order_steps, _ROOM_FOR_ORDERS), 1),
+            max_ray_segments=size_bucket(max(config.max_ray_segments, _ROOM_FOR_SEGMENTS), 2),
+            max_faces=size_bucket(max(config.max_faces, _ROOM_FOR_FACES), 1),
+        )
+        # Three times a power of two: records of a few hundred ns have the smallest size.
+        count = 3 * size_bucket(max(-(-bins.count // 3), _ROOM_FOR_BINS // 3), 1)
+        span = size_bucket(max(bins.max_span, _ROOM_FOR_SPAN), 2)
+        bins = dataclasses.replace(bins, count=count, max_span=span)
+        return dataclasses.replace(self, config=roomy, bins=bins)
+
     def jacobian_memory(self, columns: int) -> float:
         """Return the bytes of derivatives in `columns` geometric unknowns, without compilation."""
         return jacobian_bytes(
@@ -314,11 +341,12 @@ def plan(
       terrain that is a plane, and meshes that no ray of a single order meets are off unless True asks for
       them. The names are those of the table's first column. Default None.
     - `max_memory`: GB that the simulation may take, positive. Default None: a quarter of the machine's.
-    - `histories`: True to keep scattering histories, so that one trace serves all optics and wavelengths;
-      False to apply optics while light is traced, for at most 8 wavelengths, which has no limit on orders
-      but 1000, and takes less memory. Default None: histories, but where one response of them would take
-      more than 24 MB (some 18 orders of leaves over ground), or leave out orders that are likely to matter
-      (dense and bright canopies).
+    - `histories`: True to keep scattering histories, so that one trace serves all optics and wavelengths, and
+      derivatives with respect to optics take no trace; False to apply optics while light of several orders is
+      traced, for at most 8 wavelengths, which is faster, has no limit on orders but 1000, and takes less
+      memory. Default None: histories, but where one response of them would take more than 24 MB (some 18
+      orders of leaves over ground), or leave out orders that are likely to matter (dense and bright
+      canopies). `simulate` without a plan applies optics wherever it may.
     - `describe`: True to make the table of effects with its bounds, which takes some 40 ms, and of a survey
       the lines on its simulation, some tenths of a second. Default True.
 
@@ -398,6 +426,9 @@ def plan(
         scene, optics, n_channels, rtol, 1 if "multiple scattering" in off else max_orders, histories
     )
     orders = order_choice.count
+    if orders == 1 and histories is False:
+        # A single order has few histories, and no photons.
+        histories = None
     steps = order_steps(orders, n_plates, n_channels)
     # 3. Time: fine bins from the pulse's features, samples from the window.
     jitter, interval = concrete_number(lidar.jitter), concrete_number(lidar.sampling_interval)

@@ -8,6 +8,7 @@ compiled beside them, from shapes alone.
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -20,6 +21,7 @@ from jaxlidar.spectral.apply_optics import (
     WaveformModel,
     make_padded_waveform_model,
     make_waveform_model,
+    pad_wavelengths,
     samples_and_budget,
 )
 from jaxlidar.spectral.waveform import Waveform, remove_padding, waveform_of_model
@@ -149,16 +151,13 @@ def make_batch_tracer(setup: Setup, key: PRNGKeyArray) -> BatchTracer:
     """
     is_transformed = has_tracers((setup, key))
     canopy = setup.scene.canopy
-    traces_by_wavelength = (
-        canopy is not None and canopy.is_straight
-    ) or not setup.plan.config.keeps_histories
-    exact_sizes = traces_by_wavelength or is_transformed
+    exact_sizes = is_transformed or (canopy is not None and canopy.is_straight)
     make_model = make_waveform_model if exact_sizes else make_padded_waveform_model
     if is_transformed or not setup.plan.is_random:
         scene = build_device_scene(setup, derivatives="all" if is_transformed else "none")
         model = make_model(setup)
         return BatchTracer(setup, scene, model, model)
-    scene_or_shapes, finish_scene = _begin_device_scene(setup)
+    scene_or_shapes, finish_scene = _begin_device_scene(setup, exact_sizes)
     response_shapes = _begin_traces(scene_or_shapes, key)
     model = make_model(setup)
     error_model = model if exact_sizes else model.at_pivots()
@@ -169,21 +168,27 @@ def make_batch_tracer(setup: Setup, key: PRNGKeyArray) -> BatchTracer:
     return BatchTracer(setup, finish_scene(), model, error_model)
 
 
-def _begin_device_scene(setup: Setup) -> tuple[DeviceScene, Callable[[], DeviceScene]]:
-    """Begin to build a device scene without derivatives.
+def _begin_device_scene(setup: Setup, exact_sizes: bool) -> tuple[DeviceScene, Callable[[], DeviceScene]]:
+    """Begin to build a device scene without derivatives; unless `exact_sizes`, with room for wavelengths.
 
     **Returns:** the scene, with shapes in place of arrays while the program that makes these is being
     compiled, and a function that waits for its numbers.
     """
     arguments = geometry_arguments(setup, "none")
 
+    def complete(geometry: DeviceScene) -> DeviceScene:
+        scene = complete_device_scene(geometry, setup, "none")
+        if exact_sizes or scene.optics is None:
+            return scene
+        return eqx.tree_at(lambda s: s.optics, scene, pad_wavelengths(scene.optics))
+
     def finish() -> DeviceScene:
-        return complete_device_scene(compiled_geometry(*arguments), setup, "none")
+        return complete(compiled_geometry(*arguments))
 
     if compiled_geometry.is_compiled(*arguments):
         scene = finish()
         return scene, lambda: scene
-    return complete_device_scene(compiled_geometry.compile_ahead(*arguments), setup, "none"), finish
+    return complete(compiled_geometry.compile_ahead(*arguments)), finish
 
 
 def _begin_traces(scene: DeviceScene, key: PRNGKeyArray) -> Response | None:

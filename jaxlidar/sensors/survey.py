@@ -479,7 +479,14 @@ class Survey(eqx.Module):
         return in_plane * vertical, across * level
 
     @staticmethod
-    def grid(lidar: Lidar, low: Numbers, high: Numbers, spacing: Numbers) -> "Survey":
+    def grid(
+        lidar: Lidar,
+        low: Numbers,
+        high: Numbers,
+        spacing: Numbers,
+        *,
+        crs: str | int | None = None,
+    ) -> "Survey":
         """Make a survey of a regular grid of footprints, row after row from the south-west.
 
         **Arguments:**
@@ -488,6 +495,7 @@ class Survey(eqx.Module):
         - `low`: (x, y) of the first footprint in m.
         - `high`: (x, y) of the opposite corner, m, not below `low`. No footprint lies beyond it.
         - `spacing`: m between neighbours, positive, one number or (along x, along y).
+        - `crs`: coordinate reference system, as that of `Survey`. Default None: not known.
 
         **Returns:** a `Survey`; along each axis it has one footprint at `low` and as many more as fit.
 
@@ -512,7 +520,7 @@ class Survey(eqx.Module):
         counts = [_count_along(float(last[k] - first[k]), float(step[k])) for k in range(2)]
         _check_number_of_shots(f"spacing = {step.tolist()}", counts[0] * counts[1])
         x, y = (first[k] + step[k] * np.arange(counts[k]) for k in range(2))
-        return Survey(lidar, np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2))
+        return Survey(lidar, np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2), crs=crs)
 
     @staticmethod
     def track(
@@ -523,6 +531,7 @@ class Survey(eqx.Module):
         *,
         beams: int = 1,
         beam_spacing: SupportsFloat = 600.0,
+        crs: str | int | None = None,
     ) -> "Survey":
         """Make a survey of footprints along a line, of one beam or of several side by side as GEDI has.
 
@@ -534,6 +543,7 @@ class Survey(eqx.Module):
         - `spacing`: m between footprints along the track, positive; GEDI's are 60 m.
         - `beams`: number of beams, at least 1. Default 1; GEDI has 8.
         - `beam_spacing`: m between beams across the track, positive. Default 600, GEDI's.
+        - `crs`: coordinate reference system, as that of `Survey`. Default None: not known.
 
         **Returns:** a `Survey`: all footprints of the leftmost beam first, then those of the next.
 
@@ -557,7 +567,7 @@ class Survey(eqx.Module):
         along = float(spacing) * np.arange(count_along)
         across = float(beam_spacing) * (np.arange(count) - 0.5 * (count - 1))
         positions = first + across[:, None, None] * right + along[None, :, None] * forward
-        return Survey(lidar, positions.reshape(-1, 2))
+        return Survey(lidar, positions.reshape(-1, 2), crs=crs)
 
     @staticmethod
     def scan(
@@ -570,6 +580,7 @@ class Survey(eqx.Module):
         *,
         gps_time: SupportsFloat = 0.0,
         flight_line: int = 1,
+        crs: str | int | None = None,
     ) -> "Survey":
         """Make a survey of the shots of a scanner on a level platform that flies along a line.
 
@@ -586,6 +597,7 @@ class Survey(eqx.Module):
         - `pulse_rate`: shots per s, positive. A scanner that stands still takes none of these four.
         - `gps_time`: GPS time of the first shot in s, as that of `Survey`. Default 0.
         - `flight_line`: number of the flight line. Default 1.
+        - `crs`: coordinate reference system, as that of `Survey`. Default None: not known.
 
         **Returns:** a `Survey`, its shots in the order of time.
 
@@ -611,7 +623,7 @@ class Survey(eqx.Module):
         check_number("gps_time", gps_time)
         flown = {"start": start, "end": end, "speed": speed, "pulse_rate": pulse_rate}
         if lidar.altitude is None:
-            return _station(lidar, pattern, flown, float(gps_time), flight_line)
+            return _station(lidar, pattern, flown, float(gps_time), flight_line, crs)
         for field, value in flown.items():
             if value is None:
                 raise ValueError(
@@ -637,7 +649,7 @@ class Survey(eqx.Module):
         ends = np.stack([first, first + float(speed) * duration * forward])
         position = np.pad(ends, ((0, 0), (0, 1)), constant_values=float(lidar.altitude))
         yaw = np.rad2deg(np.arctan2(forward[0], forward[1]))
-        flight = Trajectory([0.0, duration], position, yaw=yaw)
+        flight = Trajectory([0.0, duration], position, yaw=yaw, crs=crs)
         time = np.arange(shots) / float(pulse_rate)
         survey = _strip(lidar, flight.at(time), pattern, flight_line)
         # Added last: GPS times of 3e8 s leave the times since the first shot fewer digits.
@@ -745,7 +757,12 @@ def _lifted(flight: Trajectory, terrain: Any) -> Trajectory:
 
 
 def _station(
-    lidar: Lidar, pattern: AbstractScan, flown: dict[str, Any], gps_time: float, flight_line: int
+    lidar: Lidar,
+    pattern: AbstractScan,
+    flown: dict[str, Any],
+    gps_time: float,
+    flight_line: int,
+    crs: str | int | None,
 ) -> Survey:
     """Return the survey of a scanner that stands at the lidar's sensor, level, and looks north."""
     for field, value in flown.items():
@@ -763,7 +780,7 @@ def _station(
     _check_number_of_shots(f"step = {pattern.step}", lines * shots)
     time = pattern.time
     place = np.broadcast_to(concrete_array(lidar.position), (time.size, 3))
-    survey = _strip(lidar, Trajectory(time, place, yaw=0.0), pattern, flight_line)
+    survey = _strip(lidar, Trajectory(time, place, yaw=0.0, crs=crs), pattern, flight_line)
     return eqx.tree_at(lambda s: s.gps_time, survey, gps_time + time)
 
 

@@ -45,8 +45,8 @@ from jaxlidar.spectral.pulse_convolution import (
 from jaxlidar.trace.photons.histories import Histories, histories
 from jaxlidar.trace.response import Response
 
-# Programs have room for at least this many wavelengths.
-MIN_WAVELENGTHS = 4
+# Programs have room for at least this many wavelengths and samples.
+MIN_WAVELENGTHS, MIN_SAMPLES = 4, 512
 # Size buckets of samples from one power of two to the next: surveys pay for each sample.
 SAMPLE_BUCKETS = 4
 # More wavelengths than this are a spectrum: standard errors are computed at pivot wavelengths.
@@ -251,9 +251,20 @@ def make_padded_waveform_model(setup: Setup) -> WaveformModel:
     plan, n_wavelengths = setup.plan, setup.lidar.wavelength.size
     if n_wavelengths > MAX_EXACT_WAVELENGTHS:
         return make_waveform_model(setup).padded_to(size_bucket(n_wavelengths, 16))
-    convolution = pulse_convolution(setup.lidar, plan, size_bucket(plan.n_samples, 1))
+    convolution = pulse_convolution(setup.lidar, plan, size_bucket(max(plan.n_samples, MIN_SAMPLES), 1))
     model = _make_model(setup, convolution, plan.sample_interval, plan.config.degree)
-    return model.padded_to(max(size_bucket(n_wavelengths), MIN_WAVELENGTHS))
+    return model.padded_to(_room_for_wavelengths(n_wavelengths))
+
+
+def pad_wavelengths(optics: Float[Array, "channels wavelengths"]) -> Float[Array, "channels room"]:
+    """Return optics with copies of the last wavelength, as many as `make_padded_waveform_model` has."""
+    missing = _room_for_wavelengths(optics.shape[1]) - optics.shape[1]
+    return jax.device_put(np.pad(np.asarray(optics), ((0, 0), (0, missing)), mode="edge"))
+
+
+def _room_for_wavelengths(n_wavelengths: int) -> int:
+    """Return the number of wavelengths for which programs have room."""
+    return max(size_bucket(n_wavelengths), MIN_WAVELENGTHS)
 
 
 def _make_model(

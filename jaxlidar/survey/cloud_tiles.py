@@ -178,6 +178,10 @@ def simulate_tiles(
     clouds = [CloudFile.of(path) for path in files]
     if not clouds:
         raise ValueError("files is empty; admissible are one or more LAS or LAZ files")
+    resolved = [cloud.path.resolve() for cloud in clouds]
+    for path in resolved:
+        if resolved.count(path) > 1:
+            raise ValueError(f"files has {path} twice; admissible is each file once")
     common_system({"survey": survey.crs} | {str(cloud.path): cloud.crs for cloud in clouds})
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)

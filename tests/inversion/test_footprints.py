@@ -240,6 +240,11 @@ def test_files_without_a_system_and_footprints_off_all_of_them_are_refused(tmp_p
         run(tmp_path, bare)
 
 
+def test_a_link_margin_is_a_number(tmp_path, cloud):
+    with pytest.raises(ValueError, match="link_margin = nan"):
+        run(tmp_path, cloud, "--link-margin", "nan")
+
+
 def test_a_scheduler_of_dask_needs_dask(tmp_path, cloud, monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "distributed", None)
     with pytest.raises(ImportError, match=r"jaxlidar\[cluster\]"):

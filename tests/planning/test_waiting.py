@@ -281,3 +281,29 @@ def test_a_change_of_a_number_compiles_nothing(entry_point, compiled_names):
         compiled_names.clear()
         entry_point(dataclasses.replace(Case(), **{name: value}))
         assert {*compiled_names} <= SHORT_PROGRAMS, name
+
+
+# Each crossed the edge of a size, or was a program of its own, before plans had room (`Plan.with_room`).
+FAR_CHANGES = {
+    "zenith": (0.0, 10.0, 25.0),
+    "fwhm": (4.0, 7.0),
+    "window": ((-90.0, 60.0), (-40.0, 10.0)),
+    "n_layers": (14, 15),
+    "divergence": (1.0,),
+    "height": (-2.0,),
+    "reflectance": (0.6,),
+    "wavelength": ((532.0, 1064.0, 1550.0), (700.0, 1064.0)),
+}
+
+
+def test_far_changes_of_a_simulation_compile_no_trace(compiled_names):
+    def simulate_to_tolerance(case):
+        jl.simulate(case.lidar, case.scene, key=KEY, rtol=case.rtol, window=case.window)
+
+    simulate_to_tolerance(Case())
+    for name, values in FAR_CHANGES.items():
+        for value in values:
+            compiled_names.clear()
+            simulate_to_tolerance(dataclasses.replace(Case(), **{name: value}))
+            traces = {program for program in compiled_names if program.startswith("batch_of")}
+            assert not traces, (name, value)

@@ -424,6 +424,18 @@ def test_a_flight_above_terrain_takes_its_crs():
     assert strip.crs == terrain.crs == "EPSG:25832"
 
 
+def test_surveys_of_patterns_state_their_crs():
+    line = {"start": (0.0, 0.0), "end": (0.0, 20.0), "crs": 25832}
+    tripod = jl.Lidar(sensor=(0.0, 0.0, 1.7))
+    surveys = [
+        jl.Survey.grid(jl.Lidar(), (0.0, 0.0), (10.0, 10.0), 5.0, crs=25832),
+        jl.Survey.track(jl.Lidar(), spacing=10.0, **line),
+        jl.Survey.scan(jl.Lidar(), jl.Conical(20.0, 40.0), speed=10.0, pulse_rate=10.0, **line),
+        jl.Survey.scan(tripod, jl.Panorama(zenith=(30.0, 150.0), step=30.0), crs=25832),
+    ]
+    assert {survey.crs for survey in surveys} == {"EPSG:25832"}
+
+
 def test_azimuths_are_below_a_full_turn():
     """A beam that is vertical but for rounding; planted: the remainder alone, which rounds up."""
     almost_north = np.array([[-1e-30, 1.0, 0.0]])

@@ -157,6 +157,15 @@ def test_inadmissible_arguments_are_refused(halves, tmp_path, changes, error, me
         jl.simulate_tiles(files, survey, tmp_path / "tiles", **arguments)
 
 
+def test_a_file_given_twice_is_refused(halves, tmp_path):
+    """Its points would count twice, under whichever name."""
+    (tmp_path / "tiles").mkdir()
+    again = tmp_path / "tiles" / ".." / "again.las"
+    again.symlink_to(halves[0])
+    with pytest.raises(ValueError, match=r"files has .* twice"):
+        jl.simulate_tiles([*halves, again], survey_at((30.0, 30.0)), tmp_path / "tiles", key=KEY)
+
+
 def test_files_of_two_systems_and_damaged_extents_are_refused(tmp_path):
     pytest.importorskip("pyproj")
     position, classes = forest_points(returns=100)
