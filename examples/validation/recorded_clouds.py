@@ -4,10 +4,10 @@
 
 NPZ has waveforms that the GEDI simulator (Hancock et al. 2019) made of the clouds LAZ, by the name of each:
 `x, y`, heights of the upper end of the first sample and the lower end of the last one, `count`, and
-`ground_count` where ground is classified. Each
-cloud becomes a canopy and a terrain (`jaxlidar.canopy_from_points`), over which the same footprints are
-simulated, with leaves as bright as the ground. Beside them stands the plain sum of points: every return has
-the weight of a Gaussian footprint over the density of last returns, without any scene.
+`ground_count` where ground is classified. Each cloud becomes a canopy and a terrain
+(`jaxlidar.canopy_from_points`), over which the same footprints are simulated, with leaves as bright as the
+ground. Beside them stands the plain sum of points: every return has the weight of a Gaussian footprint over
+the density of last returns, without any scene.
 """
 
 import sys
@@ -66,7 +66,7 @@ def simulations(points, place, height, key):
     cloud = jl.canopy_from_points(points)
     canopy = jl.Canopy(cloud.voxels, leaf=jl.LeafOptics(*LEAF))
     scene = jl.Scene(canopy=canopy, ground=cloud.terrain)
-    many = jl.simulate_many(jl.Survey(lidar(), place), scene, key=key, max_orders=1, rtol=0.03)
+    many = jl.simulate_many(jl.Survey(lidar(), place), scene, key=key, max_orders=1, rtol=0.01)
     sample_height = -0.5 * jl.SPEED_OF_LIGHT * many.time
     power = many.reflectance[:, 0]
     # Heights of samples decrease, and np.interp wants them to increase.

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 from _validation import COLOURS, comparison, finish, number, options, with_progress
-from recorded_clouds import FOOTPRINT, PULSE, lidar, middles_of_samples
+from recorded_clouds import ALTITUDE, FOOTPRINT, PULSE, lidar, middles_of_samples
 
 import jaxlidar as jl
 from inversion.footprints import simulate_footprints
@@ -40,7 +40,7 @@ def shot_of(height, record, number):
     """Return a shot of a record without noise, with the reference's pulse."""
     lag = np.arange(-40.0, 41.0)
     power = np.exp(-0.5 * (0.5 * jl.SPEED_OF_LIGHT * lag / PULSE) ** 2)
-    place = {"latitude": 0.0, "longitude": 0.0, "altitude": 4e5, "zenith": 0.0, "azimuth": 0.0}
+    place = {"latitude": 0.0, "longitude": 0.0, "altitude": ALTITUDE, "zenith": 0.0, "azimuth": 0.0}
     received = {"waveform": record, "noise_mean": 0.0, "noise_std": 3.0}
     pulse = {"pulse_time": lag, "pulse_power": power}
     return GediShot("BEAM0101", number, np.arange(float(height.size)), height, **received, **pulse, **place)

@@ -353,18 +353,11 @@ def test_recorded_shots_of_lvis(run, shared):
 
 @pytest.mark.slow
 def test_airborne_clouds(run, shared):
-    """Medians over the footprints of two clouds are within the bounds; not with a longer pulse.
-
-    The simulator counts each return once, so that pulses with many returns weigh more: the simulated crowns
-    of mixedconifer are 0.3 m higher.
-    """
+    """Medians over the footprints of two clouds are within the bounds; not with a longer pulse."""
     als = shared / "als"
     record = run(
         "recorded_clouds", als / "gedi_simulator.npz", als / "megaplot.laz", als / "mixedconifer.laz"
     )
-    (crown,) = (row for row in record["rows"] if "RH98, simulatedmixed" in row["what"] + row["case"])
-    assert 0.2 < crown["here"] < 0.4
-    record["rows"].remove(crown)
     assert holds(record, "simulated")
     assert holds(record, "sum of points")
 
