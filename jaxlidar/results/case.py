@@ -28,6 +28,7 @@ from jaxtyping import PRNGKeyArray
 
 from jaxlidar._fields.checks import check_integer, check_key, check_kind
 from jaxlidar._registry import simulate_survey
+from jaxlidar.formats.checks import existing_file
 from jaxlidar.formats.files import atomic_writes
 from jaxlidar.formats.npz import read_arrays
 from jaxlidar.progress import ProgressOption
@@ -280,8 +281,7 @@ def write_case(path: str | os.PathLike[str], case: Case) -> None:
 
 def read_case(path: Path) -> Case:
     """Read the case of a TOML file; see `jaxlidar.io.read_case`."""
-    if not path.is_file():
-        raise FileNotFoundError(f"{path}: no such file")
+    existing_file(path)
     try:
         text = path.read_bytes().decode("utf-8-sig")
     except UnicodeDecodeError as error:

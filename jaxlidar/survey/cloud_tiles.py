@@ -21,6 +21,7 @@ import functools
 import os
 import time
 import warnings
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Executor
 from pathlib import Path
@@ -141,10 +142,10 @@ def simulate_tiles(
     `recorded` and `components`. Shots more than 5 m outside of the extents of all files are in no tile.
     `jaxlidar.io.write_gedi_l1b` takes a list of such `Waveforms`.
 
-    **Raises:** what `jaxlidar.io.read_las` raises; ValueError for no file, systems that differ, a survey of
-    tilted beams or sensors, one that lies outside of all files, and numbers outside their ranges; TypeError
-    for objects of the wrong type. OSError where the folder cannot be written. RuntimeError where the worker
-    of a tile dies twice.
+    **Raises:** what `jaxlidar.io.read_las` raises; ValueError for no file, one given twice, systems that
+    differ, a survey of tilted beams or sensors, one that lies outside of all files, and numbers outside their
+    ranges; TypeError for objects of the wrong type. OSError where the folder cannot be written. RuntimeError
+    where the worker of a tile dies twice.
 
     **Source:** Hancock et al. (2019), Earth Space Sci. 6, 294.
 
@@ -178,10 +179,9 @@ def simulate_tiles(
     clouds = [CloudFile.of(path) for path in files]
     if not clouds:
         raise ValueError("files is empty; admissible are one or more LAS or LAZ files")
-    resolved = [cloud.path.resolve() for cloud in clouds]
-    for path in resolved:
-        if resolved.count(path) > 1:
-            raise ValueError(f"files has {path} twice; admissible is each file once")
+    ((path, times),) = Counter(cloud.path.resolve() for cloud in clouds).most_common(1)
+    if times > 1:
+        raise ValueError(f"files has {path} {times} times; admissible is each file once")
     common_system({"survey": survey.crs} | {str(cloud.path): cloud.crs for cloud in clouds})
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
