@@ -134,7 +134,7 @@ def section(record: dict) -> str:
         "Seconds of a call of `simulate` with three wavelengths after one change, and of the same call "
         "repeated; of two scenes the slower one. Array sizes are rounded up to size buckets, and numbers are "
         "arguments of compiled programs: the trace (`batch_of_trace_first`, `batch_of_trace_higher`) is "
-        "compiled anew where a size changes its bucket, as that of a record whose pulse, window or beam "
-        "changes may, and where an effect is new.",
+        "compiled anew where a size exceeds its bucket, as that of a record which a smaller tolerance makes "
+        "longer may, and where an effect is new.",
         table(record["changes"], columns),
     )
