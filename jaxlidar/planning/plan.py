@@ -82,7 +82,7 @@ from jaxlidar.sensors.survey import Survey
 DEFAULT_RTOL = 0.01
 # Fewer batches give no trustworthy standard error.
 MIN_BATCHES = 8
-# Least sizes of a plan with room (`Plan.with_room`). 1536 bins are 500 ns of three bins each.
+# Least sizes of a plan with room (`Plan.with_room`). 1536 bins are some 500 ns, with three bins in each.
 _ROOM_FOR_ORDERS, _ROOM_FOR_SEGMENTS, _ROOM_FOR_FACES = 32, 32, 64
 _ROOM_FOR_BINS, _ROOM_FOR_SPAN = 1536, 16
 # Local estimates (next-event estimation) per free flight through a canopy: points from which light returns to
@@ -238,8 +238,8 @@ class Plan(eqx.Module):
         """Return the plan with more room, where optics are applied while light is traced.
 
         Responses are small then, and loops end when all of their photons have: time hardly depends on sizes,
-        and most changes of a scene compile nothing. Nor is a beam at nadir a program of its own, which would
-        save a tenth of the time, a third in tall canopies. For values alone, as reverse mode keeps what every
+        and most changes of a scene compile nothing. A beam at nadir shares the program of others, although
+        one of its own would be faster in tall canopies. For values alone, as reverse mode keeps what every
         step of a loop leaves.
         """
         if self.config.keeps_histories:

@@ -211,13 +211,11 @@ def _check_or_make_plan(
     """
     arguments = {name: value for name, value in planning.items() if value is not None}
     if plan is None:
-        few_wavelengths = lidar.wavelength.size <= MAX_APPLIED_WAVELENGTHS
-        if not is_transformed and few_wavelengths:
+        if not is_transformed and lidar.wavelength.size <= MAX_APPLIED_WAVELENGTHS:
             # Histories serve other optics and their derivatives, which one call has no use for.
             arguments.setdefault("histories", False)
         plan = make_plan(lidar, scene, rtol=goal.rtol, describe=False, **arguments)
-        if not is_transformed:
-            plan = plan.with_room()
+        plan = plan if is_transformed else plan.with_room()
     elif arguments:
         raise ValueError(
             f"plan is given together with {', '.join(arguments)}; admissible is either: make the plan "

@@ -191,10 +191,8 @@ class WaveformModel(eqx.Module):
 
         def pad(a: Array, axis: int = 0) -> Array:
             # One number that serves all wavelengths stays one.
-            if a.ndim == 0 or (a.shape[axis] == 1 and n_original > 1):
-                return a
-            last = np.repeat(np.take(np.asarray(a), [-1], axis), missing, axis)
-            return jax.device_put(np.concatenate([a, last], axis))
+            is_shared = a.ndim == 0 or (a.shape[axis] == 1 and n_original > 1)
+            return a if is_shared else _repeat_last(a, axis, missing)
 
         def pad_or_none(a: Array | None) -> Array | None:
             return None if a is None else pad(a)
@@ -258,8 +256,13 @@ def make_padded_waveform_model(setup: Setup) -> WaveformModel:
 
 def pad_wavelengths(optics: Float[Array, "channels wavelengths"]) -> Float[Array, "channels room"]:
     """Return optics with copies of the last wavelength, as many as `make_padded_waveform_model` has."""
-    missing = _room_for_wavelengths(optics.shape[1]) - optics.shape[1]
-    return jax.device_put(np.pad(np.asarray(optics), ((0, 0), (0, missing)), mode="edge"))
+    return _repeat_last(optics, 1, _room_for_wavelengths(optics.shape[1]) - optics.shape[1])
+
+
+def _repeat_last(a: Array, axis: int, times: int) -> Array:
+    """Return an array with copies of its last element along an axis, made without compilation."""
+    last = np.repeat(np.take(np.asarray(a), [-1], axis), times, axis)
+    return jax.device_put(np.concatenate([a, last], axis))
 
 
 def _room_for_wavelengths(n_wavelengths: int) -> int:
