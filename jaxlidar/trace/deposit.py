@@ -13,6 +13,8 @@ the same variance of 1/4 in all. That common variance is taken out again when th
 Rows of bins have a margin at either end, which collects what falls outside the record.
 """
 
+import math
+
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float, Int
@@ -64,34 +66,39 @@ def add_rows(
     tally: Float[Array, "rows padded"],
     row: Int[Array, "*s"],
     first_bin: Int[Array, "*s"],
-    values: Float[Array, "*s n"],
+    values: Float[Array, "*s n"] | Float[Array, "*s wavelengths n"],
 ) -> Float[Array, "rows padded"]:
-    """Add runs of n contiguous bins to rows of a tally.
+    """Add runs of n contiguous bins to rows of a tally; those of wavelengths to as many rows from `row` on.
 
-    One windowed scatter costs about as much as adding one element, so that a deposit over many bins is one
-    update.
+    One windowed scatter costs about as much as adding one element, so that a deposit over many bins, or
+    wavelengths, is one update.
     """
-    n_rows, padded = tally.shape
-    index = (row * padded + first_bin).reshape(-1, 1)
     numbers = lax.ScatterDimensionNumbers(
-        update_window_dims=(1,), inserted_window_dims=(), scatter_dims_to_operand_dims=(0,)
+        update_window_dims=(1, 2), inserted_window_dims=(), scatter_dims_to_operand_dims=(0, 1)
     )
-    flat = lax.scatter_add(
-        tally.reshape(-1),
-        index,
-        values.reshape(index.shape[0], values.shape[-1]),
+    return lax.scatter_add(
+        tally,
+        _corners(row, first_bin),
+        values.reshape(row.size, -1, values.shape[-1]),
         numbers,
         # `padded_index` keeps runs within the row.
         mode=lax.GatherScatterMode.PROMISE_IN_BOUNDS,
     )
-    return flat.reshape(n_rows, padded)
 
 
 def take_rows(
-    tally: Float[Array, "rows padded"], row: Int[Array, "s"], first_bin: Int[Array, "s"], length: int
-) -> Float[Array, "s length"]:
-    """Return runs of contiguous bins of rows of a tally: the transpose of `add_rows`."""
-    index = (row * tally.shape[1] + first_bin)[:, None]
-    numbers = lax.GatherDimensionNumbers(offset_dims=(1,), collapsed_slice_dims=(), start_index_map=(0,))
+    tally: Float[Array, "rows padded"],
+    row: Int[Array, "*s"],
+    first_bin: Int[Array, "*s"],
+    shape: tuple[int, ...],
+) -> Float[Array, "..."]:
+    """Return runs of bins of rows of a tally, in the shape of the values that `add_rows` would add there."""
+    window = math.prod(shape[row.ndim : -1]), shape[-1]
+    numbers = lax.GatherDimensionNumbers(offset_dims=(1, 2), collapsed_slice_dims=(), start_index_map=(0, 1))
     mode = lax.GatherScatterMode.PROMISE_IN_BOUNDS
-    return lax.gather(tally.reshape(-1), index, numbers, (length,), mode=mode)
+    return lax.gather(tally, _corners(row, first_bin), numbers, window, mode=mode).reshape(shape)
+
+
+def _corners(row: Int[Array, "*s"], first_bin: Int[Array, "*s"]) -> Int[Array, "runs 2"]:
+    """Return the row and bin of the first value of each run."""
+    return jnp.stack([row, first_bin], axis=-1).reshape(-1, 2)

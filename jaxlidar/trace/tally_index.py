@@ -8,8 +8,6 @@ wavelength. The tally then has n_wavelengths rows for each node (or shot),
     row = node * n_wavelengths + wavelength.
 """
 
-from collections.abc import Iterable
-
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
@@ -23,13 +21,13 @@ class TallyIndex(eqx.Module):
     """The rows of a tally to which deposits of photons are added.
 
     - `number`: index of the scattering history, or of the entry node.
-    - `optical_weights`: for each wavelength, the product of optics along the path; () where histories keep
+    - `optical_weights`: the product of optics along the path, for each wavelength; None where histories keep
       optics.
     - `entry_point`: where light entered, x and y, m from the aim point; None where no shots share it.
     """
 
     number: Int[Array, "*photons"]
-    optical_weights: tuple[Float[Array, "*photons"], ...]
+    optical_weights: Float[Array, "*photons wavelengths"] | None
     entry_point: tuple[Float[Array, "*photons"], Float[Array, "*photons"]] | None = None
 
     @staticmethod
@@ -39,49 +37,39 @@ class TallyIndex(eqx.Module):
 
     def after(self, scene: DeviceScene, channel: Int[Array, "*photons"] | int) -> "TallyIndex":
         """Return the index after one more scattering; unchanged where the channel is -1."""
-        if scene.optics is None:
-            return TallyIndex(scene.history_after(self.number, channel), (), self.entry_point)
+        if self.optical_weights is None:
+            return TallyIndex(scene.history_after(self.number, channel), None, self.entry_point)
+        assert scene.optics is not None
         # A channel that is known when the program is compiled needs no look-up, and -1 no operation.
         if isinstance(channel, int):
             if channel < 0:
                 return self
-            return self._multiplied_by(scene.optics[channel])
-        factors = [jnp.where(channel >= 0, o[jnp.maximum(channel, 0)], 1.0) for o in scene.optics.T]
-        return self._multiplied_by(factors)
+            factor = jnp.broadcast_to(scene.optics[channel], self.optical_weights.shape)
+            return self._with_weights(self.optical_weights * factor)
+        factor = scene.optics.at[jnp.maximum(channel, 0)].get(mode="promise_in_bounds")
+        return self._with_weights(self.optical_weights * jnp.where(channel[..., None] >= 0, factor, 1.0))
 
     def times(self, weight: Scalar) -> "TallyIndex":
         """Return the index with optical weights that are multiplied by `weight`."""
-        return self._multiplied_by([weight for _ in self.optical_weights])
+        return self._with_weights(self.by_wavelength(weight))
 
     def after_where(
         self, where: Bool[Array, "*photons"], scene: DeviceScene, channel: Int[Array, "*photons"] | int
     ) -> "TallyIndex":
         """Return the index after one more scattering where `where` holds."""
         after = self.after(scene, channel)
-        # With optics applied the number is that of the entry node, which scattering does not change.
-        number = self.number if scene.optics is not None else jnp.where(where, after.number, self.number)
-        weights = tuple(
-            jnp.where(where, new, old) for new, old in zip(after.optical_weights, self.optical_weights)
-        )
-        return TallyIndex(number, weights, self.entry_point)
+        if after.optical_weights is None:
+            return TallyIndex(jnp.where(where, after.number, self.number), None, self.entry_point)
+        # The number is that of the entry node, which scattering does not change.
+        return self._with_weights(jnp.where(where[..., None], after.optical_weights, self.optical_weights))
 
-    def _multiplied_by(self, factors: Iterable[Array]) -> "TallyIndex":
-        weights = tuple(weight * factor for weight, factor in zip(self.optical_weights, factors))
-        return TallyIndex(self.number, weights, self.entry_point)
+    def by_wavelength(self, weight: Scalar) -> Float[Array, "*photons wavelengths"]:
+        """Return a weight times the optical weights."""
+        assert self.optical_weights is not None
+        return weight[..., None] * self.optical_weights
 
-    def rows(self, number: Int[Array, "..."] | None = None) -> list[tuple[Array, Scalar | None]]:
-        """Return pairs of the row of a tally, and the factor of the weight that is added there.
-
-        There is one pair for every wavelength where optics are applied, else one with the factor None.
-
-        `number`: shots to use in place of the index's own number. Default None.
-        """
-        number = self.number if number is None else number
-        if not self.optical_weights:
-            return [(number, None)]
-        # Wavelengths lie innermost: the rows of one shot or node are neighbours in memory.
-        n_wavelengths = len(self.optical_weights)
-        return [(number * n_wavelengths + k, weight) for k, weight in enumerate(self.optical_weights)]
+    def _with_weights(self, optical_weights: Float[Array, "*photons wavelengths"]) -> "TallyIndex":
+        return TallyIndex(self.number, optical_weights, self.entry_point)
 
 
 def add_to_tally(
@@ -95,7 +83,9 @@ def add_to_tally(
     `material`: the material, (number,), or () where the tally has no axis of materials.
     """
     # A budget is a diagnostic: its derivatives would double the work of every order.
-    for row, factor in index.rows():
-        term = weight if factor is None else weight * factor
-        tally = tally.at[(*material, row)].add(detach(term))
-    return tally
+    if index.optical_weights is None:
+        return tally.at[(*material, index.number)].add(detach(weight))
+    # Wavelengths lie innermost: those of one node are added in one run.
+    weights = detach(index.by_wavelength(weight))
+    by_node = tally.reshape(*tally.shape[:-1], -1, weights.shape[-1])
+    return by_node.at[(*material, index.number)].add(weights).reshape(tally.shape)

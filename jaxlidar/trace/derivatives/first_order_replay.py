@@ -137,7 +137,8 @@ def _of_returns(light: SegmentReturns, cotangent: Float[Array, "entries padded"]
     total = jnp.zeros_like(light.pieces[0])
     for material in light.returned:
         row = jnp.broadcast_to(material.row, light.first_bin.shape)
-        of_pieces = jnp.moveaxis(take_rows(cotangent, row, light.first_bin, light.pieces.shape[0]), -1, 0)
+        of_pieces = take_rows(cotangent, row, light.first_bin, (*row.shape, len(light.pieces)))
+        of_pieces = jnp.moveaxis(of_pieces, -1, 0)
         total = total + material.extinction * material.factor * jnp.sum(light.pieces * of_pieces, axis=0)
     return total
 

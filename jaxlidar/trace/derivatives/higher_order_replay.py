@@ -213,11 +213,11 @@ def _deposits(
 
     def of_order_two_on() -> Float[Array, "ends photons"]:
         returns = returns_of_ends(scene, ends, flown.weight.reshape(-1), None, of_returns.shape[1])
-        deposits, table = jnp.zeros_like(returns.row), of_returns.reshape(-1, of_returns.shape[-1])
+        deposits, table = jnp.zeros_like(returns.row[:, 0]), of_returns.reshape(-1, of_returns.shape[-1])
         for tally_row, values in returns.rows:
-            of_values = take_rows(table, tally_row, returns.first_bin, values.shape[-1])
-            deposits = deposits + values * of_values
-        return jnp.sum(deposits, axis=-1).reshape(flown.weight.shape)
+            of_values = take_rows(table, tally_row, returns.first_bin, values.shape)
+            deposits = deposits + jnp.sum((values * of_values).reshape(len(deposits), -1), axis=-1)
+        return deposits.reshape(flown.weight.shape)
 
     return lax.cond(is_deposited(scene, order), of_order_two_on, lambda: jnp.zeros_like(flown.weight))
 

@@ -213,6 +213,8 @@ def move_landings(
         moved_w=vec(moved(a, b) for a, b in zip(p.w, w)),
         distance=moved(flights.distance, distance),
         ratio=moved(flights.ratio, flights.ratio * jnp.broadcast_to(ratio, lands.shape)),
+        # They belong to whole flights, not to ends, and are not needed any more.
+        path_slopes=None,
     )
 
 

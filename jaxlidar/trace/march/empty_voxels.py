@@ -206,13 +206,14 @@ def add_tangents_of_empty_voxels(
     def trace_chunk(in_chunk: Lanes, weights: Array, draws: PhotonDraws, order: Int[Array, ""]):
         is_placing = jnp.asarray(True)
         flown, ends, placed, onward = empty_voxels.trace_chunk(batch, in_chunk, draws, order, is_placing)
-        factor = jnp.where(placed >= 0, of_voxels[jnp.maximum(placed, 0)], 0.0).reshape(-1, 1)
+        factor = jnp.where(placed >= 0, of_voxels[jnp.maximum(placed, 0)], 0.0)
 
         def deposit(weights: Array) -> Array:
             weight, n_entries = flown.weight.reshape(-1), tally.weights.shape[1]
             returns = returns_of_ends(empty_voxels.scene, ends, weight, None, n_entries)
             for row, values in returns.rows:
-                weights = add_rows(weights, row, returns.first_bin, values * factor)
+                of_voxel = factor.reshape(-1, *(1,) * (values.ndim - 1))
+                weights = add_rows(weights, row, returns.first_bin, values * of_voxel)
             return weights
 
         return onward, lax.cond(is_deposited(scene, order), deposit, lambda w: w, weights)

@@ -56,7 +56,7 @@ class Flight(eqx.Module):
     cell: Int[Array, "*photons"]
     distance: Float[Array, "*photons"]
     ratio: Float[Array, "*photons"]
-    depth_slopes: Float[Array, "ends parameters photons"] | None = None
+    depth_slopes: Float[Array, "ends photons parameters"] | None = None
     path_slopes: PathSlopes | None = None
     moved_w: Vec | None = None
 
@@ -182,6 +182,8 @@ def sample_flights(
         )
         path_slopes = crossing.path_slopes
         collided, cell, depth_slopes = crossing.crossed, crossing.cell, crossing.depth_slopes
+        if depth_slopes is not None:
+            depth_slopes = jnp.swapaxes(depth_slopes, 1, 2)
         # Looked up again rather than carried through the march, whose loop takes most of the time.
         k = jnp.where(collided, jax.vmap(medium.extinction, (0, None))(cell, p.w), 1.0)
         chord = jnp.where(collided, crossing.chord, 1.0)

@@ -9,7 +9,6 @@ survives with the probability E / f, and its weight is divided by that. This is 
 """
 
 import dataclasses
-import functools
 
 import equinox as eqx
 import jax
@@ -97,7 +96,7 @@ def _trace_chunk(
     down = add_to_tally(down, (), index, jnp.where(escaped & (flown.p.w[2] <= 0), weight, 0.0))
     p, tally = scatter(scene, flown, tally)
     # By the largest energy of all wavelengths: one photon carries them all, and ends for all at once.
-    energy = scene.config.photons_per_batch * p.weight * functools.reduce(jnp.maximum, p.optical_weights)
+    energy = scene.config.photons_per_batch * p.weight * jnp.max(p.optical_weights, axis=-1)
     survival = jnp.minimum(energy / _ROULETTE_ENERGY, 1.0)
     # No derivatives are taken, which these numbers are for elsewhere.
     is_alive = p.alive & (batch.lattices_of_empty_voxels(chunk.lane, order)[0] < survival)

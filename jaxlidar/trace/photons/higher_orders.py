@@ -394,10 +394,11 @@ class FlownPhotons(NamedTuple):
     u: Float[Array, "ends photons"]
     max_length: Float[Array, "photons"]
 
-    # All arrays by end have ends along their first axis; each photon goes on from its own selected one.
+    # Arrays by end have ends along their first axis, and photons along the second; each photon goes on from
+    # its own selected end.
     def select_end(self, a: Array) -> Array:
         """Return an array by end at the selected end of each photon."""
-        number = self.selected.reshape((1,) * (a.ndim - 1) + self.selected.shape)
+        number = self.selected.reshape(1, -1, *(1,) * (a.ndim - 2))
         return jnp.take_along_axis(a, number, 0, mode="promise_in_bounds")[0]
 
 
@@ -464,7 +465,7 @@ def fly(
         flights=flights,
         encounters=encounters,
         weight=to_ends(p.weight) * flights.ratio,
-        index=jax.tree.map(to_ends, TallyIndex.of(p)),
+        index=jax.tree.map(lambda a: jnp.broadcast_to(a, (ends, *a.shape)), TallyIndex.of(p)),
         selected=selected.astype(jnp.int32),
         u=u,
         max_length=max_length,
@@ -502,7 +503,7 @@ def scatter(
     # first alone.
     weight = weight * collision.weight * collision.onward_weight
     tally = tally.with_departure(collision.material, index, weight)
-    if index.optical_weights:
+    if index.optical_weights is not None:
         # The geometric weight doubles at every scattering by a leaf, and the optical weight halves: over
         # hundreds of orders only their product stays in the range of single precision.
         weight, index = jnp.ones_like(weight), index.times(weight)
@@ -511,7 +512,7 @@ def scatter(
         assert flight.depth_slopes is not None
         # The score grows by the collision and falls by the depth flown (`trace.derivatives.score_functions`).
         at_collision = collision_score(scene, flight.cell, flight.collided, collision)
-        score = p.score - flight.depth_slopes.T + at_collision
+        score = p.score - flight.depth_slopes + at_collision
     onward = Photons(
         x=clear_of_mesh(scene, x, collision.w, collision.surface, collision.normal),
         w=collision.w,
@@ -596,12 +597,13 @@ def collide_at_ends(scene: DeviceScene, flown: FlownPhotons) -> FlightEnds:
     """
     ends = scene.config.deposits_per_flight
 
-    def flatten(tree):
-        return jax.tree.map(lambda a: jnp.broadcast_to(a, (ends, a.shape[-1])).reshape(-1), tree)
+    def flatten(a: Array) -> Array:
+        return jnp.broadcast_to(a, (ends, a.shape[-1])).reshape(-1)
 
-    p = dataclasses.replace(flown.p, score=None, w=flown.flights.direction(flown.p))
+    p = dataclasses.replace(flown.p, score=None, optical_weights=None, w=flown.flights.direction(flown.p))
     flights = dataclasses.replace(flown.flights, depth_slopes=None, moved_w=None)
-    p, flights, encounters, draws, index = flatten((p, flights, flown.encounters, flown.draws, flown.index))
+    p, flights, encounters, draws = jax.tree.map(flatten, (p, flights, flown.encounters, flown.draws))
+    index = jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:]), flown.index)
     return FlightEnds(p, flights, draws, index, *collide(scene, p, flights, encounters, draws))
 
 
@@ -616,8 +618,7 @@ def _deposit_flights(scene: DeviceScene, flown: FlownPhotons, tally: HigherOrder
     ends = collide_at_ends(scene, flown)
     if score is not None:
         assert depth_slopes is not None
-        score = score[None] - jnp.swapaxes(depth_slopes, 1, 2)
-        score = score.reshape(-1, score.shape[-1])
+        score = (score[None] - depth_slopes).reshape(-1, score.shape[-1])
         score = score + collision_score(scene, ends.flights.cell, ends.flights.collided, ends.collision)
     n_entries = tally.weights.shape[1]
     returns = returns_of_ends(scene, ends, flown.weight.reshape(-1), score, n_entries)
@@ -736,14 +737,23 @@ def _returns_of_collisions(
         time, value, material = time[:, None] + delay, value[:, None] * seen, material[:, None]
     # One row serves all channels and wavelengths, which differ by factors alone.
     first_bin, row = barrier(bspline_row(bins, time, value))
-    rows = []
-    for channel, factor in channel_factors:
-        factor = jnp.where(channel >= 0, factor, 0.0)
-        for tally_row, optical_weight in index.after(scene, channel).rows(shots):
-            # Optimisation barrier: fused into the rows, the factor would be computed again for each bin.
-            scaled = barrier(factor if optical_weight is None else factor * optical_weight)
-            scaled = scaled.reshape(scaled.shape + (1,) * (row.ndim - 1))
-            rows.append((material * n_entries + tally_row, row * scaled))
+    # Optimisation barriers: fused into the rows, factors would be computed again for each bin.
+    if scene.optics is None:
+        rows = []
+        for channel, factor in channel_factors:
+            factor = barrier(jnp.where(channel >= 0, factor, 0.0))
+            history = index.after(scene, channel).number
+            rows.append((material * n_entries + history, row * factor[:, None]))
+    else:
+        # Channels differ by optics alone: one row has their sum, at all wavelengths.
+        factors = [
+            index.after(scene, channel).by_wavelength(jnp.where(channel >= 0, factor, 0.0))
+            for channel, factor in channel_factors
+        ]
+        of_wavelengths = barrier(functools.reduce(jnp.add, factors))
+        values = row[..., None, :] * of_wavelengths.reshape(len(row), *(1,) * (row.ndim - 2), -1, 1)
+        first_row = (index.number if shots is None else shots) * scene.optics.shape[1]
+        rows = [(material * n_entries + first_row, values)]
     return BinnedReturns(first_bin, rows, row, channel_factors, index, score)
 
 

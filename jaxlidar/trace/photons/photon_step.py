@@ -39,7 +39,9 @@ def start_photons(
     # With shot views, times are relative to a shot whose axis goes through the point of entry:
     # `ShotViews.seen_by_shots` adds the delay of each shot.
     entry_path = 0.0 if scene.shot_views is None else 2.0 * dot(point, w)
-    n_wavelengths = 0 if scene.optics is None else scene.optics.shape[1]
+    optical_weights = None
+    if scene.optics is not None:
+        optical_weights = jnp.ones((*index.shape, scene.optics.shape[1]), excess.dtype)
     return Photons(
         x=along(point, w, to_start),
         w=w,
@@ -49,7 +51,7 @@ def start_photons(
         surface=jnp.full(index.shape, -1, jnp.int32),
         last_scattering=scene.if_differentiated(not_scattered(excess)),
         alive=alive,
-        optical_weights=tuple(jnp.ones_like(excess) for _ in range(n_wavelengths)),
+        optical_weights=optical_weights,
         entry_point=None if scene.shot_views is None else entry,
         score=None if scene.slopes is None else jnp.zeros((*index.shape, scene.slopes.count)),
     )

@@ -50,7 +50,7 @@ class Photons(eqx.Module):
     - `alive`: False for photons that left the scene, flew too far to be recorded, or ended by roulette, and
       for padding.
     - `optical_weights`: for each wavelength, the product of optics along the path and of geometric weights up
-      to the last scattering, where optics are applied while light is traced; otherwise empty.
+      to the last scattering, where optics are applied while light is traced; otherwise None.
     - `entry_point`: x and y of where light entered the scene, m, where shots share it; otherwise None. Then
       `path` is relative to a shot whose axis goes through that point.
     - `score`: derivatives of the log path probability (see `trace.derivatives.score_functions`), or None.
@@ -64,7 +64,7 @@ class Photons(eqx.Module):
     surface: Int[Array, "photons"]
     last_scattering: LastScattering | None
     alive: Bool[Array, "photons"]
-    optical_weights: tuple[Float[Array, "photons"], ...] = ()
+    optical_weights: Float[Array, "photons wavelengths"] | None = None
     entry_point: tuple[Float[Array, "photons"], Float[Array, "photons"]] | None = None
     score: Float[Array, "photons parameters"] | None = None
 
