@@ -5,6 +5,8 @@ mode, for the same key: replay walks the same paths. Forward mode itself is comp
 `test_derivatives.py`; here reverse mode is, for single voxels, by a z-test.
 """
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -136,6 +138,34 @@ def test_forward_and_reverse_agree(name, build, zenith, orders, names):
     # Planted: a derivative that is 1 % off.
     with pytest.raises(AssertionError):
         np.testing.assert_allclose(1.01 * reverse, forward, rtol=2e-4, atol=2e-5 * scale)
+
+
+@pytest.mark.slow
+def test_few_numbers_have_the_same_derivatives_in_directions(monkeypatch):
+    """Derivatives with respect to a height: in its direction, which is the default, and by reverse mode."""
+
+    def over_ground_at(p):
+        ground = jl.Ground(reflectance=0.5, height=p["height"])
+        return dataclasses.replace(leaves_over_ground(p), ground=ground)
+
+    def gradient():
+        loss = problem(over_ground_at, 12.0, 2)
+        return jax.jit(jax.grad(lambda height: loss(START | {"height": height}, jax.random.key(1))))(-0.2)
+
+    def spied(*arguments):
+        traced.append(arguments)
+        return original(*arguments)
+
+    traced, original = [], replay._pull_back_in_directions
+    monkeypatch.setitem(START, "height", jnp.asarray(-0.2))
+    monkeypatch.setattr(replay, "_pull_back_in_directions", spied)
+    in_directions = gradient()
+    # Of the first order, and of all others.
+    assert len(traced) == 2
+    monkeypatch.setattr(replay, "_MAX_DIRECTIONS", 0)
+    np.testing.assert_allclose(in_directions, gradient(), rtol=2e-4)
+    assert len(traced) == 2
+    assert in_directions != 0.0
 
 
 @pytest.mark.slow
