@@ -89,6 +89,7 @@ UNITS = {
     "bounds": "m",
     "clump_diameter": "m",
     "divergence": DEGREES,
+    "ellipse_turn": DEGREES,
     "end": "m",
     "frequency": "1/s",
     "gps_time": "s",

@@ -135,9 +135,10 @@ class Lidar(eqx.Module):
       irradiance, for a top-hat across the disc. Default 0.3.
     - `level_divergence`: that across the vertical plane of the beam, mrad, in (0, 300], of an elliptical
       Gaussian beam; `divergence` is then that within this plane, which is that of `azimuth` for a beam
-      straight down. On a level platform, a line scanner has `divergence` along the scan; with pitch, and
-      straight down, the ellipse turns with the azimuths of the beams. Default None: as `divergence`, a round
-      beam.
+      straight down. Default None: as `divergence`, a round beam.
+    - `ellipse_turn`: angle by which an ellipse is turned about the beam, degrees, clockwise from the sensor:
+      `divergence` then lies beside the vertical plane. `Survey.scan` and `Survey.fly` set that of every shot,
+      so that `level_divergence` lies along `AbstractScan.level_axis`, however the platform leans. Default 0.
     - `aperture`: diameter of the receiver in m, positive. Default 0.2.
     - `zenith`: angle between the beam and straight down (nadir) in degrees, in [0, 89]; with `sensor` in
       [0, 180], where 90 is level and 180 straight up. Default 0.
@@ -232,6 +233,7 @@ class Lidar(eqx.Module):
         range=Range(0.0, _MAX_DIVERGENCE, low_open=True),
         converter=as_optional_scalar,
     )
+    ellipse_turn: Float[Array, ""] = quantity(unit=DEGREES, converter=as_scalar)
 
     # Not the one of the dataclass: `sensor` is an argument, and a property that every lidar has.
     def __init__(
@@ -254,6 +256,7 @@ class Lidar(eqx.Module):
         scan: Any = None,
         level_divergence: Any = None,
         sensor: Any = None,
+        ellipse_turn: Any = 0.0,
     ):
         if sensor is not None:
             for field, value in (("altitude", altitude), ("position", position)):
@@ -283,7 +286,7 @@ class Lidar(eqx.Module):
         # Made here and not with the signature: importing the package starts no device.
         self.pulse = GaussianPulse() if isinstance(pulse, _Default) else pulse
         self.receiver = Receiver() if isinstance(receiver, _Default) else receiver
-        self.scan, self.level_divergence = scan, level_divergence
+        self.scan, self.level_divergence, self.ellipse_turn = scan, level_divergence, ellipse_turn
 
     def __check_init__(self):
         check_kind("pulse", self.pulse, AbstractPulse, "a pulse, such as GaussianPulse(fwhm=6.0)")

@@ -89,6 +89,17 @@ class AbstractScan(eqx.Module):
         **Returns:** (shots, 3) directions. Of a lidar with an altitude, the third component is positive.
         """
 
+    def level_axis(self, time: Float[np.ndarray, " shots"]) -> Float[np.ndarray, "shots 3"]:
+        """Unit vectors beside which `Lidar.level_divergence` of an elliptical beam lies, in the same frame.
+
+        The axis of the ellipse is the part of this vector across the beam; the other axis, `divergence`, lies
+        across both. Forward, unless a pattern says otherwise: `divergence` of a line scanner is then that
+        along its lines.
+
+        **Arguments:** `time`: (shots,) s since the start of the line.
+        """
+        return np.tile([1.0, 0.0, 0.0], (len(time), 1))
+
 
 @final
 class Oscillating(AbstractScan):
@@ -274,6 +285,17 @@ class Panorama(AbstractScan):
         return np.arange(lines * shots) / (shots * self.line_rate)
 
     def direction(self, time: Float[np.ndarray, " shots"]) -> Float[np.ndarray, "shots 3"]:
+        zenith, azimuth = self._angles(time)
+        level = np.sin(zenith)
+        return np.stack([level * np.cos(azimuth), level * np.sin(azimuth), np.cos(zenith)], axis=-1)
+
+    def level_axis(self, time: Float[np.ndarray, " shots"]) -> Float[np.ndarray, "shots 3"]:
+        """Beside the line that is drawn: `divergence` is that along it."""
+        _, azimuth = self._angles(time)
+        return np.stack([-np.sin(azimuth), np.cos(azimuth), np.zeros_like(azimuth)], axis=-1)
+
+    def _angles(self, time: Float[np.ndarray, " shots"]) -> tuple[np.ndarray, np.ndarray]:
+        """Return the zenith angle of each shot and the azimuth of its line, in rad."""
         lines, shots = self.shape
         # A shot at the start of a line may lie before it by rounding.
         turn = as_numpy(time, "time") * self.line_rate
@@ -281,9 +303,7 @@ class Panorama(AbstractScan):
         (step, line_step), ends = self._steps, (self.zenith, self.azimuth)
         rise, advance = (math.copysign(s, last - first) for s, (first, last) in zip((step, line_step), ends))
         zenith = np.deg2rad(self.zenith[0] + rise * shots * (turn - line))
-        azimuth = np.deg2rad(self.azimuth[0] + advance * (line % lines))
-        level = np.sin(zenith)
-        return np.stack([level * np.cos(azimuth), level * np.sin(azimuth), np.cos(zenith)], axis=-1)
+        return zenith, np.deg2rad(self.azimuth[0] + advance * (line % lines))
 
 
 @final
@@ -343,6 +363,10 @@ class Risley(AbstractScan):
                 f"wedge = {self.wedge} reflects the beam in place of refracting it; admissible are smaller "
                 "angles"
             )
+
+    def level_axis(self, time: Float[np.ndarray, " shots"]) -> Float[np.ndarray, "shots 3"]:
+        """To the right: level where the scanner looks ahead."""
+        return np.tile([0.0, 1.0, 0.0], (len(time), 1))
 
     def direction(self, time: Float[np.ndarray, " shots"]) -> Float[np.ndarray, "shots 3"]:
         return self._refracted(2.0 * np.pi * as_numpy(time, "time")[:, None] * np.array(self.frequency))

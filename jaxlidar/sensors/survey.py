@@ -93,6 +93,7 @@ class Survey(eqx.Module):
       number. `Survey.fly` takes that of the trajectory. Default None: not known.
     - `attitude`: (shots, 3) roll, pitch and yaw of the platform in degrees, as those of `Trajectory`, which
       `Survey.fly` and `Survey.scan` give. Default None: not known.
+    - `ellipse_turn`: as that of `Lidar`, degrees, one number or (shots,). Default None: the lidar's.
     - `stated`: (shots, 6) what is stated of shots by sensors where their geometry is another one: x, y and z
       of the sensor in m, zenith and azimuth in degrees, and the error of the range in m.
       `Survey.disturbed` makes it. Default None: the geometry itself.
@@ -122,6 +123,7 @@ class Survey(eqx.Module):
     flight_line: Int[np.ndarray, " shots"] | None
     crs: str | None = eqx.field(static=True)
     attitude: Float[np.ndarray, "shots 3"] | None
+    ellipse_turn: Float[np.ndarray, " shots"] | None
     stated: Float[np.ndarray, "shots 6"] | None
 
     def __init__(
@@ -138,6 +140,7 @@ class Survey(eqx.Module):
         flight_line: Numbers | None = None,
         crs: str | int | None = None,
         attitude: Numbers | None = None,
+        ellipse_turn: Numbers | None = None,
         stated: Numbers | None = None,
     ):
         self.crs = crs_name(crs)
@@ -172,6 +175,7 @@ class Survey(eqx.Module):
                 raise ValueError("flight_line has values that are not whole numbers")
         self.flight_line = None if lines is None else lines.astype(int)
         self.attitude = _optional_rows("attitude", attitude, (shots, 3))
+        self.ellipse_turn = _optional_per_shot("ellipse_turn", ellipse_turn, shots)
         self.stated = _optional_rows("stated", stated, (shots, 6))
         if self.stated is not None and not has_sensors:
             raise ValueError("stated is given with position; admissible is sensor, or stated = None")
@@ -202,7 +206,7 @@ class Survey(eqx.Module):
         def rows(a: np.ndarray | None) -> np.ndarray | None:
             return None if a is None else a[shots]
 
-        names = ("zenith", "azimuth", "altitude", *_OPTIONAL_ROWS, "flight_line", "stated")
+        names = ("zenith", "azimuth", "altitude", *_OPTIONAL_ROWS, "ellipse_turn", "flight_line", "stated")
         place = {"sensor" if self.has_sensor_position else "position": self.position[shots]}
         fields = {name: rows(getattr(self, name)) for name in names}
         return Survey(self.lidar, **place, **fields, crs=self.crs)
@@ -243,6 +247,8 @@ class Survey(eqx.Module):
         """Place the lidar at a position, in the direction of a shot."""
         angles = {name: jnp.asarray(getattr(self, name)[shot], float) for name in ("zenith", "azimuth")}
         altitude = None if self.altitude is None else jnp.asarray(self.altitude[shot], float)
+        if self.ellipse_turn is not None:
+            angles["ellipse_turn"] = jnp.asarray(self.ellipse_turn[shot], float)
         return dataclasses.replace(self.lidar, position=position, altitude=altitude, **angles)
 
     def _index(self, shot: Any) -> int:
@@ -298,6 +304,8 @@ class Survey(eqx.Module):
             return None if any(a is None for a in arrays) else np.concatenate(arrays)
 
         fields = {name: rows(name) for name in ("zenith", "azimuth", "altitude", *_OPTIONAL_ROWS)}
+        if any(survey.ellipse_turn is not None for survey in surveys):
+            fields["ellipse_turn"] = np.concatenate([survey._turn_of_ellipse for survey in surveys])
         if any(survey.stated is not None for survey in surveys):
             fields["stated"] = np.concatenate([survey.stated_rows for survey in surveys])
         crs = common_system({f"surveys[{i}]": survey.crs for i, survey in enumerate(surveys)})
@@ -409,13 +417,16 @@ class Survey(eqx.Module):
             draws = of_lines.normal(size=(lines.max() + 1, len(deviations), 3))[lines]
             error = {name: d * draws[:, i] for i, (name, d) in enumerate(deviations.items())}
             range_error = float(range) * of_shots.normal(size=shots)
-        zenith, azimuth = self.zenith, self.azimuth
+        zenith, azimuth, ellipse_turn = self.zenith, self.azimuth, self.ellipse_turn
         if turns:
             assert self.attitude is not None
-            in_body = np.einsum("sji,sj->si", body_rotation(*self.attitude.T), self.direction)
+            to_body = body_rotation(*self.attitude.T)
             true_rotation = body_rotation(*(self.attitude + error["attitude"]).T)
-            direction = np.einsum("sij,jk,sk->si", true_rotation, rotation_matrix(*turn), in_body)
-            zenith, azimuth = beam_angles(direction)
+            rotation = np.einsum("sij,jk,slk->sil", true_rotation, rotation_matrix(*turn), to_body)
+            zenith, azimuth = beam_angles(np.einsum("sij,sj->si", rotation, self.direction))
+            if ellipse_turn is not None:
+                level_axis = np.einsum("sij,sj->si", rotation, self._axes_of_ellipse[1])
+                ellipse_turn = _turn_about_beam(zenith, azimuth, level_axis)
         stated = self.stated_rows
         stated[:, 5] += range_error
         names = (*_OPTIONAL_ROWS, "flight_line")
@@ -426,6 +437,7 @@ class Survey(eqx.Module):
             azimuth=azimuth,
             **{name: getattr(self, name) for name in names},
             crs=self.crs,
+            ellipse_turn=ellipse_turn,
             stated=stated,
         )
 
@@ -469,14 +481,26 @@ class Survey(eqx.Module):
 
     @property
     def footprint_axes(self) -> tuple[Float[np.ndarray, "shots 3"], Float[np.ndarray, "shots 3"]]:
-        """Semi-axes (shots, 3) of footprints over `footprint_radius`: in the vertical plane, and level."""
-        zenith, azimuth = np.deg2rad(self.zenith), np.deg2rad(self.azimuth)
-        sin, cos = np.sin(azimuth), np.cos(azimuth)
-        vertical = np.stack([np.cos(zenith) * sin, np.cos(zenith) * cos, np.sin(zenith)], axis=-1)
-        level = np.stack([cos, -sin, np.zeros_like(sin)], axis=-1)
+        """Semi-axes (shots, 3) of footprints over `footprint_radius`: those of `divergence`, then the others.
+
+        Unless ellipses are turned, the first lie in the vertical planes of beams, and the others are level.
+        """
         ratios = [1.0, 1.0] if self.lidar.ellipse is None else map(concrete_number, self.lidar.ellipse)
-        in_plane, across = ratios
-        return in_plane * vertical, across * level
+        first, second = (ratio * axis for ratio, axis in zip(ratios, self._axes_of_ellipse))
+        return first, second
+
+    @property
+    def _turn_of_ellipse(self) -> Float[np.ndarray, " shots"]:
+        if self.ellipse_turn is not None:
+            return self.ellipse_turn
+        return np.full(len(self), concrete_number(self.lidar.ellipse_turn))
+
+    @property
+    def _axes_of_ellipse(self) -> tuple[Float[np.ndarray, "shots 3"], Float[np.ndarray, "shots 3"]]:
+        """Unit vectors along which `divergence` and `level_divergence` lie."""
+        vertical, level = _axes_across(self.zenith, self.azimuth)
+        turn = np.deg2rad(self._turn_of_ellipse)[:, None]
+        return np.cos(turn) * vertical + np.sin(turn) * level, np.cos(turn) * level - np.sin(turn) * vertical
 
     @staticmethod
     def grid(
@@ -797,12 +821,15 @@ def _strip(
     1. Directions in the frame of the scanner, turned into that of the body, and into east, north and up.
     2. The sensors, off the trajectory by the lever arm.
     3. Zenith, azimuth and scan angle; where beams meet the reference plane, for a lidar with an altitude.
+    4. The turn of an elliptical footprint about each beam.
     """
-    direction = np.asarray(pattern.direction(flight.time - flight.time[0]), float)
-    if scanner_turn is not None:
-        direction = direction @ scanner_turn.T
-    turn, sensor = flight.rotation, flight.position
-    direction = np.einsum("sij,sj->si", turn, direction)
+    time, turn, sensor = flight.time - flight.time[0], flight.rotation, flight.position
+
+    def to_map(vectors: Float[np.ndarray, "shots 3"]) -> Float[np.ndarray, "shots 3"]:
+        in_body = vectors if scanner_turn is None else vectors @ scanner_turn.T
+        return np.einsum("sij,sj->si", turn, in_body)
+
+    direction = to_map(np.asarray(pattern.direction(time), float))
     if lever_arm is not None:
         sensor = sensor + turn @ lever_arm
     east, north, up = direction.T
@@ -812,6 +839,9 @@ def _strip(
     scan_angle = np.rad2deg(np.arctan2(east * np.cos(yaw) - north * np.sin(yaw), -up))
     order: dict[str, Any] = {"gps_time": flight.time, "scan_angle": scan_angle, "flight_line": flight_line}
     order |= {"crs": flight.crs, "attitude": np.stack([flight.roll, flight.pitch, flight.yaw], axis=1)}
+    if lidar.level_divergence is not None:
+        level_axis = to_map(np.asarray(pattern.level_axis(time), float))
+        order["ellipse_turn"] = _turn_about_beam(zenith, azimuth, level_axis)
     if lidar.has_sensor_position:
         return Survey(lidar, sensor=sensor, zenith=zenith, azimuth=azimuth, **order)
     # A pattern at the limit may exceed it by rounding.
@@ -846,6 +876,31 @@ def beam_directions(
     zenith, azimuth = np.deg2rad(zenith), np.deg2rad(azimuth)
     horizontal = np.sin(zenith)
     return np.stack([horizontal * np.sin(azimuth), horizontal * np.cos(azimuth), -np.cos(zenith)], axis=-1)
+
+
+def _axes_across(
+    zenith: Float[np.ndarray, " shots"], azimuth: Float[np.ndarray, " shots"]
+) -> tuple[Float[np.ndarray, "shots 3"], Float[np.ndarray, "shots 3"]]:
+    """Return unit vectors across beams: in the vertical plane, upwards; and level, to the right."""
+    zenith, azimuth = np.deg2rad(zenith), np.deg2rad(azimuth)
+    sin, cos = np.sin(azimuth), np.cos(azimuth)
+    vertical = np.stack([np.cos(zenith) * sin, np.cos(zenith) * cos, np.sin(zenith)], axis=-1)
+    return vertical, np.stack([cos, -sin, np.zeros_like(sin)], axis=-1)
+
+
+def _turn_about_beam(
+    zenith: Float[np.ndarray, " shots"],
+    azimuth: Float[np.ndarray, " shots"],
+    level_axis: Float[np.ndarray, "shots 3"],
+) -> Float[np.ndarray, " shots"]:
+    """Return by how many degrees an ellipse is turned whose level axis lies beside these vectors.
+
+    Zero where such a vector lies along the beam.
+    """
+    upward, aside = (np.sum(axis * level_axis, axis=1) for axis in _axes_across(zenith, azimuth))
+    is_along = np.hypot(upward, aside) < 1e-9
+    # An ellipse is the same after half a turn.
+    return np.where(is_along, 0.0, np.rad2deg(np.arctan2(-upward, aside)) % 180.0)
 
 
 def _place(lidar: Lidar, position: Any, altitude: Any, sensor: Any) -> Float[np.ndarray, "shots axes"]:

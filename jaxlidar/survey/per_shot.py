@@ -125,7 +125,8 @@ class ShotGeometry(NamedTuple):
     """Geometry of shots; axis 0 is the shots'.
 
     - `number`: of each in the survey. - `position`: m, from the survey's origin. - `zenith`, `azimuth`:
-      degrees. - `altitude`: m; None where `position` is that of the sensor.
+      degrees. - `altitude`: m; None where `position` is that of the sensor. - `ellipse_turn`: degrees; None
+      where it is that of the lidar.
     """
 
     number: Int[Array, "*shots"] | np.ndarray
@@ -133,6 +134,7 @@ class ShotGeometry(NamedTuple):
     zenith: Float[Array, "*shots"] | np.ndarray
     azimuth: Float[Array, "*shots"] | np.ndarray
     altitude: Float[Array, "*shots"] | np.ndarray | None
+    ellipse_turn: Float[Array, "*shots"] | np.ndarray | None
 
     def in_precision(self) -> "ShotGeometry":
         """Return the same in JAX's present precision."""
@@ -153,15 +155,15 @@ class ShotGeometry(NamedTuple):
 def shot_geometry(survey: Survey, first: int, count: int) -> ShotGeometry:
     """Return `count` shots from number `first` on."""
     shots = np.arange(first, first + count)
-    altitude = None if survey.altitude is None else survey.altitude[shots]
-    position, zenith, azimuth = (a[shots] for a in (survey.position, survey.zenith, survey.azimuth))
-    return ShotGeometry(shots.astype(np.int32), position, zenith, azimuth, altitude)
+    names = ("position", "zenith", "azimuth", "altitude", "ellipse_turn")
+    rows = jax.tree.map(lambda a: a[shots], {name: getattr(survey, name) for name in names})
+    return ShotGeometry(shots.astype(np.int32), **rows)
 
 
 def lidar_of_shot(lidar: Lidar, shot: ShotGeometry) -> Lidar:
     """Return the lidar aimed at one shot."""
     # `tree_at` sets fields without the constructor's checks, which traced values cannot have.
-    names = ("position", "zenith", "azimuth", *(() if shot.altitude is None else ("altitude",)))
+    names = [name for name in shot._fields[1:] if getattr(shot, name) is not None]
     return eqx.tree_at(
         lambda v: tuple(getattr(v, name) for name in names),
         lidar,

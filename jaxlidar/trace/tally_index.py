@@ -58,7 +58,7 @@ class TallyIndex(eqx.Module):
     ) -> "TallyIndex":
         """Return the index after one more scattering where `where` holds."""
         after = self.after(scene, channel)
-        if after.optical_weights is None:
+        if after.optical_weights is None or self.optical_weights is None:
             return TallyIndex(jnp.where(where, after.number, self.number), None, self.entry_point)
         # The number is that of the entry node, which scattering does not change.
         return self._with_weights(jnp.where(where[..., None], after.optical_weights, self.optical_weights))

@@ -42,17 +42,17 @@ def simulate(lidar, scene, **options):
 
 
 @pytest.mark.parametrize("placed_by", ["altitude", "sensor"])
-@pytest.mark.parametrize("aspect", [30.0, 60.0, 120.0])
-def test_a_tilted_plane_has_the_second_moment_of_the_ellipse(placed_by, aspect):
+@pytest.mark.parametrize(("aspect", "ellipse_turn"), [(30.0, 0.0), (60.0, 0.0), (120.0, 0.0), (60.0, 50.0)])
+def test_a_tilted_plane_has_the_second_moment_of_the_ellipse(placed_by, aspect, ellipse_turn):
     """The variance of ranges at nadir is that of heights: tan^2(slope) times that of the footprint."""
     azimuth, slope = 30.0, 20.0
-    beam = lidar(azimuth=azimuth, placed_by=placed_by)
+    beam = lidar(azimuth=azimuth, placed_by=placed_by, ellipse_turn=ellipse_turn)
     wave = simulate(beam, jl.Scene(ground=jl.Ground(reflectance=0.3, slope=slope, aspect=aspect)))
     time, power = (np.asarray(a, float) for a in (wave.time, wave.reflectance[0]))
     mean = np.sum(power * time) / power.sum()
     variance = np.sum(power * (time - mean) ** 2) / power.sum()
     # Along the azimuth and across it, to the right.
-    turn = math.radians(aspect - azimuth)
+    turn = math.radians(aspect - azimuth - ellipse_turn)
     w1, w2 = (0.5e-3 * d * 500.0 for d in (VERTICAL, LEVEL))
 
     def of_footprint(w1, w2):
@@ -154,6 +154,73 @@ def test_the_derivative_of_an_edge_by_both_divergences():
     np.testing.assert_allclose(slopes, expected, rtol=0.02)
 
 
+def test_a_turned_ellipse_meets_an_edge_beside_an_inclined_beam():
+    """In a survey, too; the turn is from the vertical plane to the right."""
+    zenith, azimuth, turn = 40.0, 70.0, 50.0
+    beam = lidar(zenith, azimuth, placed_by="sensor")
+    turns = [turn, turn - 90.0]
+    survey = jl.Survey(beam, sensor=[beam.sensor] * 2, ellipse_turn=turns)
+    angle = math.radians(turn)
+    edge = half_plane((math.cos(angle), math.sin(angle)), 0.8, zenith, azimuth)
+    many = jl.simulate_many(survey, jl.Scene(meshes=[edge]), key=jax.random.key(0), max_orders=1, rtol=0.003)
+    shares = many.reflectance.sum(axis=(1, 2)) / 0.5
+    np.testing.assert_allclose(shares, [beyond_edge(n, 0.8) for n in ((1, 0), (0, 1))], atol=0.006)
+    # The planted wrong answer: an ellipse that is not turned.
+    assert abs(beyond_edge((math.cos(angle), math.sin(angle)), 0.8) - shares[0]) > 0.02
+    assert [float(shot.ellipse_turn) for shot in survey] == pytest.approx(turns)
+    assert survey[1:].ellipse_turn.tolist() == turns[1:]
+    both = jl.Survey.join([survey, jl.Survey(beam, sensor=[beam.sensor])])
+    assert both.ellipse_turn.tolist() == [*turns, 0.0]
+
+
+@pytest.mark.parametrize("placed_by", ["altitude", "sensor"])
+def test_an_ellipse_keeps_its_place_in_the_scanner_however_the_platform_leans(placed_by):
+    """Straight down and with pitch, where the vertical plane of the beam is any other."""
+    flight = jl.Trajectory(
+        [0.0, 1.0, 2.0],
+        [(0, 0, 500), (30, 0, 500), (60, 0, 500)],
+        roll=[0, 1, -2],
+        pitch=[0, 4, -3],
+        yaw=[60, 60, 75],
+    )
+    flight = flight.at(np.linspace(0.0, 2.0, 21))
+    survey = jl.Survey.fly(flight, jl.Oscillating(10.0, 0.5), lidar=lidar(placed_by=placed_by))
+    first, second = (a / np.linalg.norm(a, axis=1, keepdims=True) for a in survey.footprint_axes)
+    forward = flight.rotation[:, :, 0]
+    # The scan plane lies across the forward axis.
+    np.testing.assert_allclose(np.abs(np.sum(second * forward, axis=1)), 1.0, atol=1e-9)
+    np.testing.assert_allclose(np.sum(first * survey.direction, axis=1), 0.0, atol=1e-9)
+    np.testing.assert_allclose(np.sum(first * forward, axis=1), 0.0, atol=1e-9)
+    # The planted wrong answer: an ellipse in the vertical plane of each beam.
+    level = eqx.tree_at(lambda s: s.ellipse_turn, survey, None).footprint_axes[1]
+    assert np.min(np.abs(np.sum(level * forward, axis=1)) / np.linalg.norm(level, axis=1)) < 0.5
+
+
+def test_an_ellipse_turns_with_the_platform_that_flies_otherwise_than_stated():
+    flight = jl.Trajectory([0.0, 1.0], [(0, 0, 500), (30, 0, 500)], yaw=90.0)
+    line = jl.Survey.fly(flight, jl.Oscillating(10.0, 0.2), lidar=lidar(placed_by="sensor"))
+    turned = line.disturbed(boresight=(0.0, 0.0, 30.0))
+    np.testing.assert_allclose(line.footprint_axes[1][0] * [1, 0, 1], line.footprint_axes[1][0], atol=1e-12)
+    level = turned.footprint_axes[1]
+    east_of_north = np.rad2deg(np.arctan2(level[:, 0], level[:, 1])) % 180.0
+    np.testing.assert_allclose(east_of_north, 120.0, atol=1e-6)
+
+
+def test_the_axes_of_patterns_lie_across_their_beams():
+    """A panorama draws its lines along `divergence`; of prisms that look ahead, the level axis is level."""
+    tripod = lidar(placed_by="sensor")
+    panorama = jl.Survey.scan(tripod, jl.Panorama(zenith=(30.0, 150.0), step=30.0))
+    assert np.all(np.minimum(panorama.ellipse_turn, 180.0 - panorama.ellipse_turn) < 1e-9)
+    still = jl.Trajectory([0.0, 1.0], [(0, 0, 500)] * 2, yaw=0.0)
+    prisms = jl.Risley(wedge=(10.0, 10.0), frequency=(3.0, -1.3))
+    ahead = jl.Survey.fly(still, prisms, lidar=tripod, pulse_rate=20.0, mounting=(0.0, 90.0, 0.0))
+    upward, level = ahead.footprint_axes
+    assert np.all(np.abs(level[:, 2]) < 0.05 * np.linalg.norm(level, axis=1))
+    assert np.all(np.abs(upward[:, 2]) > 0.9 * np.linalg.norm(upward, axis=1))
+    round_beams = jl.Survey.scan(jl.Lidar(sensor=(0, 0, 2)), jl.Panorama((30.0, 60.0), step=30.0))
+    assert round_beams.ellipse_turn is None
+
+
 def test_surveys_labels_and_coverage_see_the_ellipse():
     beam = lidar(placed_by="sensor")
     # Panels east and north of the axis, 1 m away: outside the ellipse's level axis, within the other.
@@ -189,6 +256,7 @@ def test_surveys_labels_and_coverage_see_the_ellipse():
         ({"level_divergence": 0.0}, r"level_divergence = 0 .*\(0, 300\]"),
         ({"divergence": 0.0}, "level_divergence is given with divergence = 0"),
         ({"level_divergence": [1.0, 2.0]}, "level_divergence has shape"),
+        ({"ellipse_turn": math.nan}, "ellipse_turn = nan"),
     ],
 )
 def test_inadmissible_ellipses_are_refused(fields, message):

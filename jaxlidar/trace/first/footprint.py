@@ -26,7 +26,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from jaxlidar._vectors import FAR, Scalar, Vec, add, dot, from_frame, normalise, scale, to_frame, vec
+from jaxlidar._vectors import FAR, Scalar, Vec, add, cross, dot, from_frame, normalise, scale, to_frame, vec
 from jaxlidar.sensors.field_of_view import visible_fraction
 from jaxlidar.sensors.lidar import Lidar
 
@@ -201,9 +201,11 @@ def make_beam(lidar: Lidar) -> Beam:
     """Make the beam of a lidar."""
     slant, axis, ellipse = lidar.range_to_reference, vec(lidar.direction), None
     if lidar.ellipse is not None:
-        # The level direction across the beam is (cos, -sin, 0) of the azimuth; the other lies beside it.
-        azimuth = jnp.deg2rad(lidar.azimuth)
-        x, y, _ = to_frame(axis, vec([jnp.cos(azimuth), -jnp.sin(azimuth), jnp.zeros_like(azimuth)]))
+        # Unless the ellipse is turned, its level axis is (cos, -sin, 0) of the azimuth.
+        azimuth, turn = jnp.deg2rad(lidar.azimuth), jnp.deg2rad(lidar.ellipse_turn)
+        level = vec([jnp.cos(azimuth), -jnp.sin(azimuth), jnp.zeros_like(azimuth)])
+        turned = add(scale(level, jnp.cos(turn)), scale(cross(axis, level), jnp.sin(turn)))
+        x, y, _ = to_frame(axis, turned)
         in_plane, level = lidar.ellipse
         ellipse = (x, y, level, in_plane)
     return Beam(

@@ -95,6 +95,7 @@ def _trace_chunk(
     )
     down = add_to_tally(down, (), index, jnp.where(escaped & (flown.p.w[2] <= 0), weight, 0.0))
     p, tally = scatter(scene, flown, tally)
+    assert p.optical_weights is not None
     # By the largest energy of all wavelengths: one photon carries them all, and ends for all at once.
     energy = scene.config.photons_per_batch * p.weight * jnp.max(p.optical_weights, axis=-1)
     survival = jnp.minimum(energy / _ROULETTE_ENERGY, 1.0)
