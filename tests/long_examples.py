@@ -29,6 +29,7 @@ LONG_EXAMPLES = {
     "jaxlidar.simulation.one_scene.UnfollowedLightWarning",
     "jaxlidar.spectral.waveform.Waveform.true_returns",
     "jaxlidar.survey.returns.DiscreteReturns",
+    "jaxlidar.survey.returns.DiscreteReturns.labelled",
     "jaxlidar.survey.coverage.OffMapWarning",
     "jaxlidar.survey.simulate_many.simulate_many",
     "jaxlidar.survey.waveforms.Waveforms",

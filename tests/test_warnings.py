@@ -57,6 +57,7 @@ def test_a_survey_that_leaves_the_map():
     assert "jl.simulate_many(" in line_of_warning(call, jl.OffMapWarning)
 
 
+@pytest.mark.slow
 def test_a_derivative_that_jax_takes():
     mesh = (np.array([[-9.0, -9.0, 0.0], [9.0, -9.0, 0.0], [0.0, 9.0, 0.0]]), np.array([[0, 1, 2]]))
     surface = jl.MeshSurface(mesh, reflectance=0.4)
@@ -117,21 +118,23 @@ def test_frames_of_other_packages_are_the_users():
     assert (caught[0].filename, caught[0].lineno) == ("extension.py", 2)
 
 
+VOXELS = jl.VoxelMap.from_lad(np.full((4, 4, 2), 0.5), voxel_size=1.0, origin=(0.0, 0.0, 4.0))
+BELOW = np.tile([2.0, 2.0, 1.5], (2, 1))
+UPWARDS = jl.Survey(jl.instrument("RIEGL VZ-400"), sensor=BELOW, zenith=[180.0, 0.0], azimuth=0.0)
+
+
+def crown():
+    canopy = jl.Canopy(VOXELS, leaf=jl.LeafOptics(0.4, 0.4))
+    return jl.Scene(canopy=canopy, ground=jl.Ground(reflectance=0.3))
+
+
+def simulated(survey, scene):
+    return jl.simulate_many(survey, scene, key=KEY, rtol=0.3, max_orders=1)
+
+
 def test_returns_of_crowns_alone():
-    """Shots upwards into voxels are told; those that see the ground as well, or leaves, are not."""
-    voxels = jl.VoxelMap.from_lad(np.full((4, 4, 2), 0.5), voxel_size=1.0, origin=(0.0, 0.0, 4.0))
-    leaf = jl.LeafOptics(0.4, 0.4)
-    crown = jl.Scene(canopy=jl.Canopy(voxels, leaf=leaf), ground=jl.Ground(reflectance=0.3))
-    leaves = jl.Scene(meshes=[jl.leaf_mesh(voxels, 0.05, key=KEY, leaf=leaf)])
-    sensor = np.tile([2.0, 2.0, 1.5], (2, 1))
-    upwards = jl.Survey(jl.instrument("RIEGL VZ-400"), sensor=sensor, zenith=[180.0, 0.0], azimuth=0.0)
-    downwards = jl.Survey(jl.Lidar(divergence=0.01), [(2.0, 2.0)])
-    wide = jl.Survey(jl.Lidar(divergence=300.0, sensor=(0, 0, 0)), sensor=sensor, zenith=180.0)
-
-    def simulated(survey, scene):
-        return jl.simulate_many(survey, scene, key=KEY, rtol=0.3, max_orders=1)
-
-    many = simulated(upwards, crown)
+    """Shots upwards into voxels are told."""
+    many = simulated(UPWARDS, crown())
 
     def call():
         many.returns()
@@ -139,6 +142,14 @@ def test_returns_of_crowns_alone():
     assert "many.returns()" in line_of_warning(call, UserWarning)
     with pytest.warns(UserWarning, match="1 of 2 shots see crowns alone, by beams narrower than voxels"):
         many.returns()
+
+
+@pytest.mark.slow
+def test_returns_of_ground_leaves_and_wide_beams():
+    """Nothing is told of shots that see the ground as well, leaves, or more than a voxel."""
+    leaves = jl.Scene(meshes=[jl.leaf_mesh(VOXELS, 0.05, key=KEY, leaf=jl.LeafOptics(0.4, 0.4))])
+    downwards = jl.Survey(jl.Lidar(divergence=0.01), [(2.0, 2.0)])
+    wide = jl.Survey(jl.Lidar(divergence=300.0, sensor=(0, 0, 0)), sensor=BELOW, zenith=180.0)
     # Warnings are errors in tests.
-    for survey, scene in ((upwards, leaves), (downwards, crown), (wide, crown)):
+    for survey, scene in ((UPWARDS, leaves), (downwards, crown()), (wide, crown())):
         simulated(survey, scene).returns()

@@ -192,6 +192,7 @@ def test_surveys_that_make_no_sense_are_refused(example, make, legs, options, me
         example.read_survey(make(legs, **options))
 
 
+@pytest.mark.slow
 def test_the_whole_run_labels_points_by_their_parts(example, make, tmp_path, capsys):
     path = make(TURN, root='<scannerSettings id="set" pulseFreq_hz="1000" scanFreq_hz="5"/>')
     returns = example.main([str(path), "--every", "3", "--out", str(tmp_path / "a.las")])

@@ -440,6 +440,7 @@ def test_standard_errors_are_those_of_scatter(run):
     assert wrong["rows"][0]["here"] > 1.6
 
 
+@pytest.mark.slow
 def test_photons_on_slopes(run, monkeypatch):
     """190 simulated segments hold by their errors; not by the narrow echo of level ground."""
     assert holds(run("photons_on_slopes", "--every", "23"))

@@ -128,6 +128,7 @@ def test_rounding_does_not_uncover_the_scene_of_the_plan(make, altitude, beam):
     assert jax.jit(lambda arrays: is_covered(plan, *eqx.combine(arrays, static)))(arrays)
 
 
+@pytest.mark.slow
 def test_lost_tells_in_a_batch_and_derivatives_stay_finite():
     plan = jl.plan(LIDAR, PLATES, max_orders=2, n_photons=512, describe=False)
 

@@ -116,6 +116,7 @@ def test_the_mean_first_order_return_has_the_hot_spot(leaf_angles):
     assert stats.chi2.sf(min(two_ways, across), 15) < 1e-6
 
 
+@pytest.mark.slow
 def test_returns_vary_more_with_larger_leaves():
     """Variance of the gap fraction of footprints of 0.5 m; of voxels it is the same in all."""
     start, direction = rays(0.0, spacing=0.05)

@@ -62,6 +62,7 @@ def test_a_panorama_turns_with_its_platform():
     np.testing.assert_allclose(survey.direction[[0, 2]], [(0, 0, -1), (1, 0, 0)], atol=1e-12)
 
 
+@pytest.mark.slow
 def test_a_tripod_sees_the_walls_of_a_room():
     """Ranges to the sides of a square room are half its width over the sine of the azimuth."""
     corners = [(x, y, z) for z in (-5.0, 5.0) for x, y in ((-3, -3), (3, -3), (3, 3), (-3, 3))]

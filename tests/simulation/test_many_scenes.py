@@ -97,6 +97,7 @@ def test_the_plan_of_a_stack_serves_all_of_its_scenes():
         check_plan(by_one, LIDAR, corners[-1])
 
 
+@pytest.mark.slow
 def test_layers_of_the_tallest_scene_count_for_the_segments_of_a_ray():
     def layers(thickness):
         voxels = jl.VoxelMap.from_extinction(

@@ -258,6 +258,7 @@ def test_the_hot_spot_of_any_angles():
     np.testing.assert_allclose(by_vmap, [eager, beside], rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_a_periodic_slab_is_the_same_in_a_wide_area():
     """Rays start some 5 km before they meet it, at the zenith angle 80 degrees."""
     options = {"sun": (30.0, 0.0), "view": (80.0, 90.0), "wavelengths": 865.0, "n_photons": 8192}

@@ -87,6 +87,7 @@ def test_tiles_and_files_do_not_show_at_their_borders(halves, tmp_path, monkeypa
     assert np.abs(alone - reference)[0].max() > 0.1
 
 
+@pytest.mark.slow
 def test_ground_without_returns_is_black_and_shots_outside_are_in_no_tile(halves, tmp_path):
     survey = survey_at((10.0, 30.0), (52.0, 52.0), (66.0, 30.0))
     parts = jl.simulate_tiles(halves, survey, tmp_path, key=KEY, tile=20.0, rtol=0.1)

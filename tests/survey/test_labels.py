@@ -86,6 +86,7 @@ def test_planes_of_known_tilt(zenith):
         assert np.abs(np.rad2deg(np.arccos(upper[:, 2])) - returns.incidence).max() > 5.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("placed_by", ["sensor", "altitude"])
 def test_a_sphere_has_radial_normals(placed_by):
     """At the distance b from the axis of a sphere of radius r, the incidence is arcsin(b / r)."""
@@ -132,6 +133,7 @@ def half_plane(sign, height, rise=0.0, **instances):
     return jl.MeshSurface(mesh, {"leaf": 0.4}, instances=jl.MeshInstances(**instances))
 
 
+@pytest.mark.slow
 def test_two_trees_share_a_footprint():
     """The nearer crown lies west of the beam's axis, the other east: a return of each, with its number."""
     west, east = (
@@ -172,6 +174,7 @@ def stand():
     return jl.Stand(shrubs, place, [0, 0, 0, 0, 1, 1], turns, scale, leaf_area=0.02 * scale[:, 0] ** 2)
 
 
+@pytest.mark.slow
 def test_leaves_have_the_numbers_of_their_trees(stand):
     """Beams without width: each label is that of the triangle that is met first, searched one by one."""
     leaves = jl.leaf_mesh(stand, 0.02, key=jax.random.key(1))

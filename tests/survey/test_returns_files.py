@@ -137,6 +137,7 @@ def test_the_command_converts_waveforms_to_points(tmp_path, waveforms, capsys):
     assert cli.main(["convert", source, str(tmp_path / "a.toml"), "--crs", CRS]) == 2
 
 
+@pytest.mark.slow
 def test_decomposition_needs_no_other_import(tmp_path, waveforms):
     """In a process of its own, where nothing has imported `inversion`."""
     waveforms.save(tmp_path / "strip.nc")

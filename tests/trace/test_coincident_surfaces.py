@@ -38,7 +38,7 @@ def grounds(slope=0.0):
 
 
 @pytest.mark.parametrize("height", [-1e-5, 0.0, 1e-6])
-@pytest.mark.parametrize("zenith", [0.0, 70.0])
+@pytest.mark.parametrize("zenith", [0.0, pytest.param(70.0, marks=pytest.mark.slow)])
 def test_an_opaque_mesh_in_the_ground_hides_it(height, zenith):
     lidar = jl.Lidar(zenith=zenith)
     for ground in grounds():
@@ -57,6 +57,7 @@ def test_a_mesh_in_sloping_ground():
     assert float(wave.components["ground"].sum()) == 0.0
 
 
+@pytest.mark.slow
 def test_what_the_mesh_transmits_goes_on_to_the_ground():
     reflectance, transmittance = 0.5, 0.4
     expected = reflectance + transmittance**2 * GROUND / (1.0 - reflectance * GROUND)
@@ -69,6 +70,7 @@ def test_what_the_mesh_transmits_goes_on_to_the_ground():
         assert float(budget.below[0]) == 0.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("zenith", [0.0, 45.0, 80.0, 88.0])
 def test_of_meshes_in_one_plane_rays_meet_the_first_named(zenith):
     """Sheets in one sloping plane, with triangles that differ: rounding would mix them."""
@@ -211,6 +213,7 @@ def test_an_energy_budget_of_more_than_the_light_is_an_error(monkeypatch):
         jl.simulate_many(survey, scene, key=jax.random.key(0))
 
 
+@pytest.mark.slow
 def test_the_ground_under_a_mesh_keeps_its_derivative():
     """The return of an opaque mesh does not depend on the ground in which it lies."""
     scene = jl.Scene(ground=jl.Ground(reflectance=GROUND), meshes=(sheet(reflectance=0.5),))

@@ -84,8 +84,16 @@ def beyond_edge(normal, distance, w1=0.5e-3 * VERTICAL * 500.0, w2=0.5e-3 * LEVE
     return 0.5 * math.erfc(math.sqrt(2.0) * distance / math.hypot(normal[0] * w1, normal[1] * w2))
 
 
-@pytest.mark.parametrize("placed_by", ["altitude", "sensor"])
-@pytest.mark.parametrize("zenith", [0.0, 40.0])
+@pytest.mark.parametrize(
+    ("placed_by", "zenith"),
+    [
+        ("sensor", 40.0),
+        *(
+            pytest.param(*case, marks=pytest.mark.slow)
+            for case in (("sensor", 0.0), ("altitude", 0.0), ("altitude", 40.0))
+        ),
+    ],
+)
 def test_a_step_edge_has_the_share_of_the_error_function(placed_by, zenith):
     azimuth = 70.0
     slant = 500.0 if placed_by == "sensor" or zenith == 0 else 500.0 / math.cos(math.radians(zenith))
@@ -133,6 +141,7 @@ def test_higher_orders_enter_over_the_ellipse():
         assert abs(share - beyond_edge((1, 0), 0.4)) < tolerance
 
 
+@pytest.mark.slow
 def test_the_derivative_of_an_edge_by_both_divergences():
     """d share / d divergence by the closed form; the edge lies at 30 degrees from the vertical plane."""
     turn = math.radians(30.0)

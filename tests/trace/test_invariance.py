@@ -138,6 +138,7 @@ def test_empty_voxels_around_the_crown_change_nothing(reference_wave):
         np.testing.assert_allclose(share, wave.energy_budget[name], atol=1e-4, err_msg=name)
 
 
+@pytest.mark.slow
 def test_a_lower_scene_shifts_the_time(reference_wave):
     """Scene and sensor 3 m lower: light arrives 2 * 3 m / (c cos zenith) later."""
     _, wave = reference_wave

@@ -158,6 +158,7 @@ def test_time_and_light_are_those_of_the_same_lidar_by_its_altitude():
     assert shift == pytest.approx(distance, abs=1e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rise", [0.0, 0.3])
 def test_terrain_that_is_a_plane_ends_at_its_border(rise):
     """From 60 m above the middle of 100 m, a beam 30 degrees off nadir meets it, and one of 60 does not."""

@@ -214,7 +214,7 @@ def _pull_back_in_directions(
 
     def of_number(direction: Float[Array, "numbers"]) -> Float[Array, ""]:
         tangent = jax.jvp(function, (values,), (to_values(direction),))[1]
-        products = jax.tree.map(jnp.vdot, cotangent, tangent)
+        products = jax.tree.map(lambda c, t: jnp.sum(c * t), cotangent, tangent)
         return sum(jax.tree.leaves(products), jnp.zeros((), numbers.dtype))
 
     return to_values(jax.vmap(of_number)(jnp.eye(numbers.size, dtype=numbers.dtype)))

@@ -135,6 +135,7 @@ def test_a_waveform_and_the_fitted_scene():
     assert "converged after" in fits[0].status
 
 
+@pytest.mark.slow
 def test_within_programs():
     scene, key = jl.Scene(ground=jl.Ground(slope=5.0)), jax.random.key(1)
 

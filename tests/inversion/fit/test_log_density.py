@@ -199,6 +199,7 @@ def test_a_scene_that_the_plan_does_not_reach_has_no_density(scene):
     assert np.all(gradients[::2] != 0.0)
 
 
+@pytest.mark.slow
 def test_optics_brighter_than_the_start_have_a_density():
     """Orders are those that the start calls for: values that call for more keep their density."""
     observed, time = noisy_record(stand(), 1e-3)

@@ -12,6 +12,7 @@ from inversion.metrics import photons
 from jaxlidar._constants import PLANCK_TIMES_LIGHT
 from jaxlidar.formats.icesat2 import PhotonTrack
 from jaxlidar.sensors.photon_counter import PhotonEvents
+from tests.helpers import slow_unless
 
 # An even canopy, m above ground.
 BASE, TOP = 5.0, 15.0
@@ -329,7 +330,7 @@ def errors_of_good_ones(case, draws):
     return np.concatenate(errors)
 
 
-@pytest.mark.parametrize("case", SPARSE)
+@pytest.mark.parametrize("case", slow_unless(["background alone", "one photon"], SPARSE))
 def test_a_ground_of_few_photons_that_is_far_off_is_never_good(case):
     assert np.all(np.abs(errors_of_good_ones(case, 40)) < 2.0)
 
