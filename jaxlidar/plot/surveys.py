@@ -12,7 +12,6 @@ from jaxlidar._fields.checks import as_numpy, check_kind, check_range, check_sha
 from jaxlidar.plot.style import BEAM_COLOUR, MATERIAL_COLOURS, label_map, make_axes
 from jaxlidar.scenes.scene import Scene
 from jaxlidar.scenes.terrain import Terrain
-from jaxlidar.sensors.scan import MAX_ZENITH
 from jaxlidar.sensors.survey import Survey
 from jaxlidar.survey.coverage import ground_position
 
@@ -62,7 +61,7 @@ def survey(
     check_kind("survey", survey, Survey, "a Survey")
     check_kind("scene", scene, Scene | None, "a Scene or None")
     ax = make_axes(ax, (4.6, 4.6))
-    position, radius, long_radius = _footprints(survey, scene)
+    position, radius, long_radius, angle = _footprints(survey, scene)
     low = (position - long_radius[:, None]).min(axis=0)
     high = (position + long_radius[:, None]).max(axis=0)
     if scene is not None and isinstance(scene.ground, Terrain):
@@ -89,8 +88,6 @@ def survey(
         colours = BEAM_COLOUR if colour_values is None else colour_values
         footprints: Any = ax.scatter(*position.T, s=4.0, c=colours, linewidths=0)
     else:
-        # Ellipses are turned counterclockwise from east, azimuths clockwise from north.
-        angle = 90.0 - survey.azimuth
         layout = {"units": "x", "offsets": position, "offset_transform": ax.transData}
         footprints = EllipseCollection(2 * long_radius, 2 * radius, angle, **layout)
         if colour_values is None:
@@ -106,22 +103,27 @@ def survey(
 
 def _footprints(
     survey: Survey, scene: Scene | None
-) -> tuple[Float[np.ndarray, "shots 2"], Float[np.ndarray, " shots"], Float[np.ndarray, " shots"]]:
-    """Return the place, and the radii across and along the beam, of every footprint on the ground.
+) -> tuple[
+    Float[np.ndarray, "shots 2"],
+    Float[np.ndarray, " shots"],
+    Float[np.ndarray, " shots"],
+    Float[np.ndarray, " shots"],
+]:
+    """Return the place of every footprint on the ground, its shorter and longer radius, and its direction.
 
     A beam that meets the ground at the range r has r / R of the radius that it has at its aim point, at the
-    range R. On level ground the footprint is longer by 1 / cos(zenith) along the azimuth.
+    range R. The direction is that of the longer radius, degrees counterclockwise from east.
     """
     aim = survey.sensor if survey.has_sensor_position else survey.aim_point
     points = np.full_like(aim, np.nan) if scene is None else ground_position(survey, scene)
     met = np.asarray(np.isfinite(points).all(axis=1))
     points = np.where(met[:, None], points, aim)
     distance = np.linalg.norm(points - survey.sensor, axis=1)
-    radius = survey.footprint_radius * distance / survey.slant_range
-    # A level beam that meets no ground is a point, its sensor.
-    cosine = np.maximum(np.abs(np.cos(np.deg2rad(survey.zenith))), np.cos(np.deg2rad(MAX_ZENITH)))
-    in_plane, across = (np.linalg.norm(axes, axis=1) for axes in survey.footprint_axes)
-    return points[:, :2], across * radius, in_plane * radius / cosine
+    # The axes of an ellipse are singular vectors of any two conjugate radii.
+    directions, radii, _ = np.linalg.svd(np.stack(survey.level_footprint_axes, axis=-1))
+    radii *= (survey.footprint_radius * distance / survey.slant_range)[:, None]
+    angle = np.rad2deg(np.arctan2(directions[:, 1, 0], directions[:, 0, 0]))
+    return points[:, :2], radii[:, 1], radii[:, 0], angle
 
 
 def _draw_relief(

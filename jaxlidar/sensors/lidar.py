@@ -136,9 +136,9 @@ class Lidar(eqx.Module):
     - `level_divergence`: that across the vertical plane of the beam, mrad, in (0, 300], of an elliptical
       Gaussian beam; `divergence` is then that within this plane, which is that of `azimuth` for a beam
       straight down. Default None: as `divergence`, a round beam.
-    - `ellipse_turn`: angle by which an ellipse is turned about the beam, degrees, clockwise from the sensor:
-      `divergence` then lies beside the vertical plane. `Survey.scan` and `Survey.fly` set that of every shot,
-      so that `level_divergence` lies along `AbstractScan.level_axis`, however the platform leans. Default 0.
+    - `ellipse_turn`: angle by which an ellipse is rotated about the beam from that orientation, clockwise as
+      seen from the sensor, degrees, in [-360, 360]. `Survey.scan` and `Survey.fly` add what the scanner and
+      its platform turn each shot (`AbstractScan.level_axis`). Default 0; the field is None for a round beam.
     - `aperture`: diameter of the receiver in m, positive. Default 0.2.
     - `zenith`: angle between the beam and straight down (nadir) in degrees, in [0, 89]; with `sensor` in
       [0, 180], where 90 is level and 180 straight up. Default 0.
@@ -233,7 +233,9 @@ class Lidar(eqx.Module):
         range=Range(0.0, _MAX_DIVERGENCE, low_open=True),
         converter=as_optional_scalar,
     )
-    ellipse_turn: Float[Array, ""] = quantity(unit=DEGREES, converter=as_scalar)
+    ellipse_turn: Float[Array, ""] | None = quantity(
+        unit=DEGREES, range=Range(-360.0, 360.0), converter=as_optional_scalar
+    )
 
     # Not the one of the dataclass: `sensor` is an argument, and a property that every lidar has.
     def __init__(
@@ -256,7 +258,7 @@ class Lidar(eqx.Module):
         scan: Any = None,
         level_divergence: Any = None,
         sensor: Any = None,
-        ellipse_turn: Any = 0.0,
+        ellipse_turn: Any = None,
     ):
         if sensor is not None:
             for field, value in (("altitude", altitude), ("position", position)):
@@ -286,7 +288,9 @@ class Lidar(eqx.Module):
         # Made here and not with the signature: importing the package starts no device.
         self.pulse = GaussianPulse() if isinstance(pulse, _Default) else pulse
         self.receiver = Receiver() if isinstance(receiver, _Default) else receiver
-        self.scan, self.level_divergence, self.ellipse_turn = scan, level_divergence, ellipse_turn
+        self.scan, self.level_divergence = scan, level_divergence
+        is_round = level_divergence is None
+        self.ellipse_turn = 0.0 if ellipse_turn is None and not is_round else ellipse_turn
 
     def __check_init__(self):
         check_kind("pulse", self.pulse, AbstractPulse, "a pulse, such as GaussianPulse(fwhm=6.0)")
@@ -304,7 +308,12 @@ class Lidar(eqx.Module):
                 "in (0, inf)"
             )
         check_choice("profile", self.profile, ("gaussian", "top-hat"))
-        if self.level_divergence is not None:
+        if self.level_divergence is None:
+            if self.ellipse_turn is not None:
+                raise ValueError(
+                    "ellipse_turn is given without level_divergence; admissible are both, or None"
+                )
+        else:
             if self.profile != "gaussian":
                 raise ValueError(
                     "level_divergence is given with profile = 'top-hat'; admissible is 'gaussian', or None"
@@ -422,7 +431,7 @@ class Lidar(eqx.Module):
 
     @property
     def ellipse(self) -> tuple[Float[Array, ""], Float[Array, ""]] | None:
-        """Semi-axes of the footprint over its radius, in the vertical plane and across; None if round."""
+        """Semi-axes of the footprint over its radius, of both divergences; None if round."""
         if self.level_divergence is None:
             return None
         return self.divergence / self.largest_divergence, self.level_divergence / self.largest_divergence

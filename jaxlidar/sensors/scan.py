@@ -90,13 +90,16 @@ class AbstractScan(eqx.Module):
         """
 
     def level_axis(self, time: Float[np.ndarray, " shots"]) -> Float[np.ndarray, "shots 3"]:
-        """Unit vectors beside which `Lidar.level_divergence` of an elliptical beam lies, in the same frame.
+        """Directions of `Lidar.level_divergence` of an elliptical beam, vectors in the same frame.
 
-        The axis of the ellipse is the part of this vector across the beam; the other axis, `divergence`, lies
-        across both. Forward, unless a pattern says otherwise: `divergence` of a line scanner is then that
-        along its lines.
+        The axis of the ellipse is the component of this vector perpendicular to the beam, and `divergence`
+        lies across both. Default: forward, so that `divergence` of a line scanner is that along its lines.
+        Where the vector is parallel to the beam, the ellipse is that of the beam's vertical plane: a pattern
+        that looks ahead needs another one.
 
         **Arguments:** `time`: (shots,) s since the start of the line.
+
+        **Returns:** (shots, 3), of any length but zero.
         """
         return np.tile([1.0, 0.0, 0.0], (len(time), 1))
 
@@ -290,7 +293,7 @@ class Panorama(AbstractScan):
         return np.stack([level * np.cos(azimuth), level * np.sin(azimuth), np.cos(zenith)], axis=-1)
 
     def level_axis(self, time: Float[np.ndarray, " shots"]) -> Float[np.ndarray, "shots 3"]:
-        """Beside the line that is drawn: `divergence` is that along it."""
+        """Perpendicular to the line that is drawn: `divergence` is that along it."""
         _, azimuth = self._angles(time)
         return np.stack([-np.sin(azimuth), np.cos(azimuth), np.zeros_like(azimuth)], axis=-1)
 

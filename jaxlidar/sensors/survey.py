@@ -93,7 +93,8 @@ class Survey(eqx.Module):
       number. `Survey.fly` takes that of the trajectory. Default None: not known.
     - `attitude`: (shots, 3) roll, pitch and yaw of the platform in degrees, as those of `Trajectory`, which
       `Survey.fly` and `Survey.scan` give. Default None: not known.
-    - `ellipse_turn`: as that of `Lidar`, degrees, one number or (shots,). Default None: the lidar's.
+    - `ellipse_turn`: as that of `Lidar`, degrees, in [-360, 360], one number or (shots,). Default None: the
+      lidar's.
     - `stated`: (shots, 6) what is stated of shots by sensors where their geometry is another one: x, y and z
       of the sensor in m, zenith and azimuth in degrees, and the error of the range in m.
       `Survey.disturbed` makes it. Default None: the geometry itself.
@@ -176,6 +177,10 @@ class Survey(eqx.Module):
         self.flight_line = None if lines is None else lines.astype(int)
         self.attitude = _optional_rows("attitude", attitude, (shots, 3))
         self.ellipse_turn = _optional_per_shot("ellipse_turn", ellipse_turn, shots)
+        if self.ellipse_turn is not None:
+            check_range("ellipse_turn", self.ellipse_turn, -360.0, 360.0)
+            if lidar.level_divergence is None:
+                raise ValueError("ellipse_turn is given, but the beam of lidar is round; admissible is None")
         self.stated = _optional_rows("stated", stated, (shots, 6))
         if self.stated is not None and not has_sensors:
             raise ValueError("stated is given with position; admissible is sensor, or stated = None")
@@ -274,9 +279,9 @@ class Survey(eqx.Module):
         **Arguments:** `surveys`: one or more `Survey`s, all placed by their sensors or all by their altitude.
         Their lidars are equal but for place and direction, which are those of the shots.
 
-        **Returns:** a `Survey` of all shots in that order. `gps_time`, `scan_angle` and `attitude` are known
-        where they are for all of the surveys, and `flight_line` is theirs; where one has none, it numbers the
-        surveys from 1.
+        **Returns:** a `Survey` of all shots in that order, each with its own `ellipse_turn`. `gps_time`,
+        `scan_angle` and `attitude` are known where they are for all of the surveys, and `flight_line` is
+        theirs; where one has none, it numbers the surveys from 1.
 
         **Raises:** ValueError for no survey, and for lidars or a `crs` that differ; TypeError for other
         objects.
@@ -304,7 +309,7 @@ class Survey(eqx.Module):
             return None if any(a is None for a in arrays) else np.concatenate(arrays)
 
         fields = {name: rows(name) for name in ("zenith", "azimuth", "altitude", *_OPTIONAL_ROWS)}
-        if any(survey.ellipse_turn is not None for survey in surveys):
+        if first.lidar.level_divergence is not None:
             fields["ellipse_turn"] = np.concatenate([survey._turn_of_ellipse for survey in surveys])
         if any(survey.stated is not None for survey in surveys):
             fields["stated"] = np.concatenate([survey.stated_rows for survey in surveys])
@@ -424,7 +429,7 @@ class Survey(eqx.Module):
             true_rotation = body_rotation(*(self.attitude + error["attitude"]).T)
             rotation = np.einsum("sij,jk,slk->sil", true_rotation, rotation_matrix(*turn), to_body)
             zenith, azimuth = beam_angles(np.einsum("sij,sj->si", rotation, self.direction))
-            if ellipse_turn is not None:
+            if self.lidar.level_divergence is not None:
                 level_axis = np.einsum("sij,sj->si", rotation, self._axes_of_ellipse[1])
                 ellipse_turn = _turn_about_beam(zenith, azimuth, level_axis)
         stated = self.stated_rows
@@ -490,10 +495,24 @@ class Survey(eqx.Module):
         return first, second
 
     @property
+    def level_footprint_axes(self) -> tuple[Float[np.ndarray, "shots 2"], Float[np.ndarray, "shots 2"]]:
+        """The radii `footprint_axes` projected along the beams onto a level plane, (shots, 2) each.
+
+        Of beams less than a degree from the level, onto a plane that such a beam meets at one degree.
+        """
+        direction = self.direction
+        least = np.cos(np.deg2rad(MAX_ZENITH))
+        down = np.copysign(np.maximum(np.abs(direction[:, 2:]), least), direction[:, 2:])
+        first, second = (a[:, :2] - a[:, 2:] / down * direction[:, :2] for a in self.footprint_axes)
+        return first, second
+
+    @property
     def _turn_of_ellipse(self) -> Float[np.ndarray, " shots"]:
+        """The argument `ellipse_turn`; where it is None, that of the lidar, zero for round beams."""
         if self.ellipse_turn is not None:
             return self.ellipse_turn
-        return np.full(len(self), concrete_number(self.lidar.ellipse_turn))
+        turn = self.lidar.ellipse_turn
+        return np.full(len(self), 0.0 if turn is None else concrete_number(turn))
 
     @property
     def _axes_of_ellipse(self) -> tuple[Float[np.ndarray, "shots 3"], Float[np.ndarray, "shots 3"]]:
@@ -614,7 +633,8 @@ class Survey(eqx.Module):
 
         **Arguments:**
 
-        - `lidar`: the `Lidar` of all shots. Its own direction is not used.
+        - `lidar`: the `Lidar` of all shots. Its own direction is not used; an ellipse keeps its place in the
+          scanner (`AbstractScan.level_axis`), turned by its own `ellipse_turn`.
         - `pattern`: an `Oscillating`, a `RotatingPolygon`, a `Conical`, or another `AbstractScan`.
         - `start`, `end`: (x, y) in m of the platform at the first shot and at the end of the line.
         - `speed`: of the platform in m/s, positive.
@@ -702,7 +722,8 @@ class Survey(eqx.Module):
           times, as those of `Survey`, if they are to be those of a point cloud.
         - `scan`: an `Oscillating`, a `RotatingPolygon`, a `Conical`, or another `AbstractScan`, in the frame
           of the scanner. Its time is that since the start of the strip. Default None: `lidar.scan`.
-        - `lidar`: the `Lidar` of all shots. Its own place and direction are not used. Default None:
+        - `lidar`: the `Lidar` of all shots. Its own place and direction are not used; an ellipse keeps its
+          place in the scanner (`AbstractScan.level_axis`), turned by its own `ellipse_turn`. Default None:
           `Lidar()`.
         - `pulse_rate`: shots per s, positive, from the start of each strip to its end. Default None: one shot
           at each time of the trajectory.
@@ -840,8 +861,14 @@ def _strip(
     order: dict[str, Any] = {"gps_time": flight.time, "scan_angle": scan_angle, "flight_line": flight_line}
     order |= {"crs": flight.crs, "attitude": np.stack([flight.roll, flight.pitch, flight.yaw], axis=1)}
     if lidar.level_divergence is not None:
-        level_axis = to_map(np.asarray(pattern.level_axis(time), float))
-        order["ellipse_turn"] = _turn_about_beam(zenith, azimuth, level_axis)
+        assert lidar.ellipse_turn is not None
+        level_axis = as_numpy(pattern.level_axis(time), "level_axis of the scan pattern")
+        check_shape("level_axis of the scan pattern", level_axis, (len(time), 3))
+        check_range("level_axis of the scan pattern", level_axis)
+        turn_of_lidar = concrete_number(lidar.ellipse_turn)
+        order["ellipse_turn"] = (
+            _turn_about_beam(zenith, azimuth, to_map(level_axis)) + turn_of_lidar
+        ) % 180.0
     if lidar.has_sensor_position:
         return Survey(lidar, sensor=sensor, zenith=zenith, azimuth=azimuth, **order)
     # A pattern at the limit may exceed it by rounding.
@@ -893,12 +920,12 @@ def _turn_about_beam(
     azimuth: Float[np.ndarray, " shots"],
     level_axis: Float[np.ndarray, "shots 3"],
 ) -> Float[np.ndarray, " shots"]:
-    """Return by how many degrees an ellipse is turned whose level axis lies beside these vectors.
+    """Return by how many degrees ellipses are turned with `level_divergence` along these vectors.
 
-    Zero where such a vector lies along the beam.
+    Zero where a vector lies along its beam.
     """
     upward, aside = (np.sum(axis * level_axis, axis=1) for axis in _axes_across(zenith, azimuth))
-    is_along = np.hypot(upward, aside) < 1e-9
+    is_along = np.hypot(upward, aside) <= 1e-9 * np.linalg.norm(level_axis, axis=1)
     # An ellipse is the same after half a turn.
     return np.where(is_along, 0.0, np.rad2deg(np.arctan2(-upward, aside)) % 180.0)
 
@@ -925,7 +952,9 @@ def _at_place_of(place: Lidar, lidar: Lidar) -> Lidar:
     """Return a lidar in the place and direction of another; as it is where these are of different kinds."""
     if lidar.has_sensor_position != place.has_sensor_position:
         return lidar
-    fields = ("position", "altitude", "zenith", "azimuth")
+    fields = ["position", "altitude", "zenith", "azimuth"]
+    if lidar.level_divergence is not None and place.level_divergence is not None:
+        fields.append("ellipse_turn")
     return dataclasses.replace(lidar, **{name: getattr(place, name) for name in fields})
 
 

@@ -233,7 +233,7 @@ def off_map(survey: Survey, scene: Scene) -> Float[np.ndarray, " shots"]:
 
     1. Points of equal energy in a footprint of radius one: r follows from the energy within r, 1 - exp(-2
        r^2) of a Gaussian and r^2 of a top hat, and angles advance by the golden angle (a Fibonacci lattice).
-    2. Stretched by the footprint's radius, and by 1 / cos(zenith) along the beam's azimuth.
+    2. Stretched to the footprint on a level plane.
     3. Moved along the axis to the heights of the map's top and bottom.
 
     Only footprints near the rim of the map have any points outside; the others are not looked at.
@@ -260,9 +260,8 @@ def off_map(survey: Survey, scene: Scene) -> Float[np.ndarray, " shots"]:
     for first in range(0, len(shots), _SHOTS_PER_BLOCK):
         numbers = shots[first : first + _SHOTS_PER_BLOCK]
         block = survey.subset(numbers)
-        axis, (vertical, level) = block.direction, block.footprint_axes
-        across, along = level[:, :2], vertical[:, :2] / axis[:, 2:] ** 2
-        points = disc[:, :1] * across[:, None] + disc[:, 1:] * along[:, None]
+        axis, (first_axis, second_axis) = block.direction, block.level_footprint_axes
+        points = disc[:, :1] * second_axis[:, None] + disc[:, 1:] * first_axis[:, None]
         points = block.position[:, None] + block.footprint_radius[:, None, None] * points
         outside = np.zeros(points.shape[:2], bool)
         for z in (low[2], high[2]):

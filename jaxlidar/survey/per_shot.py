@@ -124,9 +124,11 @@ _LATTICE_STEPS = StepRule(convergence_rate=0.75, safety=1.2, min_growth=2.0, max
 class ShotGeometry(NamedTuple):
     """Geometry of shots; axis 0 is the shots'.
 
-    - `number`: of each in the survey. - `position`: m, from the survey's origin. - `zenith`, `azimuth`:
-      degrees. - `altitude`: m; None where `position` is that of the sensor. - `ellipse_turn`: degrees; None
-      where it is that of the lidar.
+    - `number`: of each in the survey.
+    - `position`: m, from the survey's origin.
+    - `zenith`, `azimuth`: degrees.
+    - `altitude`: m; None where `position` is that of the sensor.
+    - `ellipse_turn`: degrees; None where it is that of the lidar.
     """
 
     number: Int[Array, "*shots"] | np.ndarray

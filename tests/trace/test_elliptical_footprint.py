@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 
 import jaxlidar as jl
+from jaxlidar.plot.surveys import _footprints
 from jaxlidar.survey.coverage import off_map
 
 VERTICAL, LEVEL = 8.0, 3.0
@@ -213,6 +214,72 @@ def test_an_ellipse_turns_with_the_platform_that_flies_otherwise_than_stated():
     level = turned.footprint_axes[1]
     east_of_north = np.rad2deg(np.arctan2(level[:, 0], level[:, 1])) % 180.0
     np.testing.assert_allclose(east_of_north, 120.0, atol=1e-6)
+    # A roll of a survey that states no turns leaves its level axis where it is, but for that angle.
+    beam = lidar(placed_by="sensor")
+    still = jl.Survey(beam, sensor=[(0, 0, 500)], zenith=0.0, azimuth=0.0, attitude=[(0, 0, 0)])
+    rolled = still.disturbed(boresight=(0.1, 0.0, 0.0)).footprint_axes[1][0]
+    np.testing.assert_allclose(rolled / np.linalg.norm(rolled), [1.0, 0.0, 0.0], atol=0.002)
+
+
+@pytest.mark.parametrize("turn", [0.0, 90.0, 30.0])
+def test_a_turned_ellipse_lies_off_the_map_and_in_pictures_as_on_the_ground(turn):
+    """By random points of the footprint along inclined beams; by 90 degrees, divergences change places."""
+    beam = lidar(divergence=1.0, level_divergence=20.0)
+    survey = jl.Survey(beam, [(0.0, 0.0)], zenith=60.0, azimuth=20.0, ellipse_turn=turn)
+    first, second = (a[0] for a in survey.footprint_axes)
+    across = np.random.default_rng(0).normal(scale=0.5, size=(100_000, 2)) * survey.footprint_radius[0]
+    points = across[:, :1] * first + across[:, 1:] * second
+    w = survey.direction[0]
+    points = points - points[:, 2:] / w[2] * w
+    voxels = jl.VoxelMap.from_lad(np.ones((10, 10, 1)), voxel_size=(1.0, 1.0, 1e-3), origin=(-5, -5, 0))
+    off = off_map(survey, jl.Scene(canopy=jl.Canopy(voxels, leaf=jl.LeafOptics(0.4, 0.4))))
+    outside = np.mean(np.any(np.abs(points[:, :2]) > 5.0, axis=1))
+    np.testing.assert_allclose(off, outside, atol=0.02)
+    _, short, long, angle = _footprints(survey, None)
+    # Of a Gaussian, the covariance has the squares of half the radii.
+    values, vectors = np.linalg.eigh(np.cov(points[:, :2].T))
+    np.testing.assert_allclose([short[0], long[0]], 2.0 * np.sqrt(values), rtol=0.02)
+    direction = np.rad2deg(np.arctan2(vectors[1, 1], vectors[0, 1]))
+    assert abs((angle[0] - direction + 90.0) % 180.0 - 90.0) < 2.0
+    swapped = lidar(divergence=20.0, level_divergence=1.0)
+    same = jl.Survey(swapped, [(0.0, 0.0)], zenith=60.0, azimuth=20.0, ellipse_turn=turn - 90.0)
+    for a, b in zip(survey.footprint_axes, same.footprint_axes[::-1]):
+        np.testing.assert_allclose(np.abs(a), np.abs(b), atol=1e-12)
+
+
+class Ahead(jl.AbstractScan):
+    """Looks down, with a level axis of one's own."""
+
+    axis: np.ndarray
+
+    def direction(self, time):
+        return np.tile([0.0, 0.0, 1.0], (len(time), 1))
+
+    def level_axis(self, time):
+        return self.axis
+
+
+def test_a_level_axis_of_the_wrong_kind_is_named():
+    flight = jl.Trajectory([0.0, 1.0], [(0, 0, 500), (30, 0, 500)], yaw=0.0)
+
+    def fly(axis, **fields):
+        return jl.Survey.fly(flight, Ahead(np.asarray(axis)), lidar=lidar(placed_by="sensor", **fields))
+
+    for axis in ([1.0, 0.0, 0.0], np.ones((3, 3)), np.ones((2, 2))):
+        with pytest.raises(ValueError, match=r"level_axis of the scan pattern has shape .*\(2, 3\)"):
+            fly(axis)
+    with pytest.raises(ValueError, match="level_axis of the scan pattern = nan"):
+        fly([[np.nan, 0.0, 0.0]] * 2)
+    # Any length; the lidar's own turn is added.
+    np.testing.assert_allclose(fly([[0.0, 1e-12, 0.0]] * 2).ellipse_turn, 0.0, atol=1e-9)
+    np.testing.assert_allclose(fly([[0.0, 1e5, 0.0]] * 2, ellipse_turn=30.0).ellipse_turn, 30.0)
+
+
+def test_surveys_whose_lidars_are_turned_otherwise_join():
+    surveys = [jl.Survey(lidar(ellipse_turn=turn), [(0.0, 0.0)]) for turn in (5.0, 40.0)]
+    assert jl.Survey.join(surveys).ellipse_turn.tolist() == [5.0, 40.0]
+    round_beam = jl.Survey(jl.Lidar(), [(0.0, 0.0)])
+    assert jl.Survey.join([round_beam, round_beam]).ellipse_turn is None
 
 
 def test_the_axes_of_patterns_lie_across_their_beams():
@@ -266,8 +333,17 @@ def test_surveys_labels_and_coverage_see_the_ellipse():
         ({"divergence": 0.0}, "level_divergence is given with divergence = 0"),
         ({"level_divergence": [1.0, 2.0]}, "level_divergence has shape"),
         ({"ellipse_turn": math.nan}, "ellipse_turn = nan"),
+        ({"ellipse_turn": 361.0}, r"ellipse_turn = 361 .*\[-360, 360\]"),
+        ({"ellipse_turn": 5.0, "level_divergence": None}, "ellipse_turn is given without level_divergence"),
     ],
 )
 def test_inadmissible_ellipses_are_refused(fields, message):
     with pytest.raises(ValueError, match=message):
         lidar(**fields)
+
+
+def test_turns_of_round_beams_and_beyond_a_turn_are_refused():
+    with pytest.raises(ValueError, match="ellipse_turn is given, but the beam of lidar is round"):
+        jl.Survey(jl.Lidar(), [(0.0, 0.0)], ellipse_turn=5.0)
+    with pytest.raises(ValueError, match=r"ellipse_turn = 1e\+30 .*\[-360, 360\]"):
+        jl.Survey(lidar(), [(0.0, 0.0)], ellipse_turn=1e30)

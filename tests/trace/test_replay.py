@@ -140,6 +140,36 @@ def test_forward_and_reverse_agree(name, build, zenith, orders, names):
         np.testing.assert_allclose(1.01 * reverse, forward, rtol=2e-4, atol=2e-5 * scale)
 
 
+def loss_of_height():
+    """Return a loss of the height of the ground under voxels, of the first order of few rays."""
+    lidar = jl.Lidar(divergence=2.0)
+
+    def over_ground_at(height):
+        return dataclasses.replace(leaves_over_ground(START), ground=jl.Ground(height=height))
+
+    plan = jl.plan(lidar, over_ground_at(-0.2), max_orders=1, n_rays=16, window=(-60.0, 40.0))
+
+    def loss(height):
+        wave = jl.simulate(lidar, over_ground_at(height), plan=plan, key=jax.random.key(0))
+        return jnp.sum(wave.reflectance**2)
+
+    return loss
+
+
+def test_a_gradient_by_a_height_has_a_gradient():
+    """Reverse mode through reverse mode is a program: no loop in it has an unknown length."""
+    assert "while" in jax.jit(jax.grad(jax.grad(loss_of_height()))).lower(-0.2).as_text()
+
+
+@pytest.mark.slow
+def test_second_derivatives_by_a_height():
+    """Reverse mode through reverse mode, and forward through forward."""
+    loss = loss_of_height()
+    reverse, forward = (jax.jit(d(d(loss)))(-0.2) for d in (jax.grad, jax.jacfwd))
+    np.testing.assert_allclose(reverse, forward, rtol=1e-3)
+    assert forward != 0.0
+
+
 @pytest.mark.slow
 def test_few_numbers_have_the_same_derivatives_in_directions(monkeypatch):
     """Derivatives with respect to a height: in its direction, which is the default, and by reverse mode."""

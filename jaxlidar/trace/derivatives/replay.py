@@ -13,7 +13,7 @@ nor with that of orders up to 256.
 - forward: those of the function itself, and what `add_tangents` adds,
 - reverse, with respect to extinction: by the replay,
 - reverse, with respect to everything else (heights, sizes, laws): those that JAX derives, chunk by chunk; or,
-  with respect to a few numbers, those in the direction of each, which take less time to compile.
+  where few numbers of the device scene vary, directional derivatives by forward mode, which compile faster.
 """
 
 import dataclasses
@@ -36,8 +36,8 @@ from jaxlidar.trace.march.voxel_traversal import Medium
 Traced = TypeVar("Traced")
 Numbers = TypeVar("Numbers")
 
-# Derivatives in the direction of each of so many numbers run as fast as reverse mode: its backward pass walks
-# all paths once more, and keeps or repeats their steps.
+# Up to so many numbers of the device scene, directional derivatives run as fast as reverse mode, whose
+# backward pass repeats the steps of all paths. The height of a plane is three numbers, a point of it.
 _MAX_DIRECTIONS = 4
 
 
@@ -154,8 +154,7 @@ def with_replay(
             in_directions = sum(a.size for a in values) <= _MAX_DIRECTIONS
 
             def of_others(values: list[Array]) -> Traced:
-                derivatives = "forward" if in_directions else "all"
-                return trace(*scene_and_numbers(_replaced(leaves, others, values), derivatives))
+                return trace(*scene_and_numbers(_replaced(leaves, others, values), "all"))
 
             if in_directions:
                 pulled_others = _pull_back_in_directions(of_others, values, cotangent)

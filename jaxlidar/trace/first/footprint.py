@@ -201,6 +201,7 @@ def make_beam(lidar: Lidar) -> Beam:
     """Make the beam of a lidar."""
     slant, axis, ellipse = lidar.range_to_reference, vec(lidar.direction), None
     if lidar.ellipse is not None:
+        assert lidar.ellipse_turn is not None
         # Unless the ellipse is turned, its level axis is (cos, -sin, 0) of the azimuth.
         azimuth, turn = jnp.deg2rad(lidar.azimuth), jnp.deg2rad(lidar.ellipse_turn)
         level = vec([jnp.cos(azimuth), -jnp.sin(azimuth), jnp.zeros_like(azimuth)])
