@@ -257,8 +257,8 @@ class Lidar(eqx.Module):
         receiver: Any = _RECEIVER,
         scan: Any = None,
         level_divergence: Any = None,
-        sensor: Any = None,
         ellipse_turn: Any = None,
+        sensor: Any = None,
     ):
         if sensor is not None:
             for field, value in (("altitude", altitude), ("position", position)):
@@ -289,8 +289,9 @@ class Lidar(eqx.Module):
         self.pulse = GaussianPulse() if isinstance(pulse, _Default) else pulse
         self.receiver = Receiver() if isinstance(receiver, _Default) else receiver
         self.scan, self.level_divergence = scan, level_divergence
-        is_round = level_divergence is None
-        self.ellipse_turn = 0.0 if ellipse_turn is None and not is_round else ellipse_turn
+        if ellipse_turn is None and level_divergence is not None:
+            ellipse_turn = jnp.zeros(())
+        self.ellipse_turn = ellipse_turn
 
     def __check_init__(self):
         check_kind("pulse", self.pulse, AbstractPulse, "a pulse, such as GaussianPulse(fwhm=6.0)")
