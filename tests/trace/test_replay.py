@@ -156,11 +156,17 @@ def loss_of_height():
     return loss
 
 
+# JAX 0.10 transposes the loops of such programs in another way, and refuses.
+needs_newer_jax = pytest.mark.skipif(jax.__version_info__ < (0, 12), reason="JAX is older than 0.12")
+
+
+@needs_newer_jax
 def test_a_gradient_by_a_height_has_a_gradient():
     """Reverse mode through reverse mode is a program: no loop in it has an unknown length."""
     assert "while" in jax.jit(jax.grad(jax.grad(loss_of_height()))).lower(-0.2).as_text()
 
 
+@needs_newer_jax
 @pytest.mark.slow
 def test_second_derivatives_by_a_height():
     """Reverse mode through reverse mode, and forward through forward."""
