@@ -137,8 +137,8 @@ class Lidar(eqx.Module):
       Gaussian beam; `divergence` is then that within this plane, which is that of `azimuth` for a beam
       straight down. Default None: as `divergence`, a round beam.
     - `ellipse_turn`: angle by which an ellipse is rotated about the beam from that orientation, clockwise as
-      seen from the sensor, degrees, in [-360, 360]. `Survey.scan` and `Survey.fly` add what the scanner and
-      its platform turn each shot (`AbstractScan.level_axis`). Default None: not turned, or a round beam.
+      seen from the sensor, degrees, in [-360, 360]. `Survey.scan` and `Survey.fly` add the rotation of the
+      scanner and its platform (`AbstractScan.level_axis`). Default None: not rotated, or a round beam.
     - `aperture`: diameter of the receiver in m, positive. Default 0.2.
     - `zenith`: angle between the beam and straight down (nadir) in degrees, in [0, 89]; with `sensor` in
       [0, 180], where 90 is level and 180 straight up. Default 0.

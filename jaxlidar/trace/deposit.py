@@ -68,8 +68,9 @@ def add_rows(
     first_bin: Int[Array, "*s"],
     values: Float[Array, "*s n"] | Float[Array, "*s wavelengths n"],
 ) -> Float[Array, "rows padded"]:
-    """Add runs of n contiguous bins to rows of a tally; those of wavelengths to as many rows from `row` on.
+    """Add runs of n contiguous bins to rows of a tally.
 
+    With an axis of wavelengths, values are added to as many consecutive rows, the first of which is `row`.
     One windowed scatter costs about as much as adding one element, so that a deposit over many bins, or
     wavelengths, is one update.
     """
@@ -92,7 +93,10 @@ def take_rows(
     first_bin: Int[Array, "*s"],
     shape: tuple[int, ...],
 ) -> Float[Array, "..."]:
-    """Return runs of bins of rows of a tally, in the shape of the values that `add_rows` would add there."""
+    """Return runs of contiguous bins of rows of a tally: the transpose of `add_rows`.
+
+    `shape`: that of the values which `add_rows` would add there, and of the result.
+    """
     window = math.prod(shape[row.ndim : -1]), shape[-1]
     numbers = lax.GatherDimensionNumbers(offset_dims=(1, 2), collapsed_slice_dims=(), start_index_map=(0, 1))
     mode = lax.GatherScatterMode.PROMISE_IN_BOUNDS

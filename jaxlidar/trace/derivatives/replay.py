@@ -36,8 +36,8 @@ from jaxlidar.trace.march.voxel_traversal import Medium
 Traced = TypeVar("Traced")
 Numbers = TypeVar("Numbers")
 
-# Up to so many numbers of the device scene, directional derivatives run as fast as reverse mode, whose
-# backward pass repeats the steps of all paths. The height of a plane is three numbers, a point of it.
+# Directional derivatives compile faster than reverse mode, whose backward pass repeats the steps of paths,
+# but take longer the more numbers of the device scene vary. The height of a plane is three: a point of it.
 _MAX_DIRECTIONS = 4
 
 
@@ -208,7 +208,7 @@ def with_replay(
 def _pull_back_in_directions(
     function: Callable[[list[Array]], Traced], values: list[Array], cotangent: Traced
 ) -> list[Array]:
-    """Return the cotangents of values: the derivative in the direction of each number times the cotangent."""
+    """Return the cotangents of values: the directional derivative by each number times the cotangent."""
     numbers, to_values = ravel_pytree(values)
 
     def of_number(direction: Float[Array, "numbers"]) -> Float[Array, ""]:
