@@ -15,7 +15,7 @@ from jaxlidar._fields.checks import check_kind, concrete, concrete_array, has_tr
 from jaxlidar._fields.crs import common_system
 from jaxlidar._fields.ranges import Range
 from jaxlidar._text import object_text
-from jaxlidar._vectors import FAR
+from jaxlidar._vectors import FAR, dot, vec
 from jaxlidar.scenes.atmosphere import Atmosphere
 from jaxlidar.scenes.canopy import Canopy
 from jaxlidar.scenes.mesh_surface import MeshSurface
@@ -237,7 +237,8 @@ def _gaps(surfaces: tuple[AbstractSurface, ...]) -> Iterator[tuple[tuple[int, in
     planes = [(i, shape) for i, shape in planes if isinstance(shape, Plane)]
     for (i, first), (j, second) in itertools.combinations(planes, 2):
         parallel = jnp.abs(jnp.sum(first.upward * second.upward)) > 1.0 - 1e-6
-        gap = jnp.abs(jnp.sum(first.upward * (second.foot - first.foot)))
+        between = vec(there - here for here, there in zip(first.foot, second.foot))
+        gap = jnp.abs(dot(vec(first.upward), between))
         yield (i, j), jnp.where(parallel, gap, FAR)
 
 

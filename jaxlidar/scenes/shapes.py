@@ -22,7 +22,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from jaxlidar._fields.checks import array_namespace, as_array, as_scalar, fixed_array
-from jaxlidar._vectors import FAR, Scalar, Vec, dot, vec
+from jaxlidar._vectors import FAR, Scalar, Vec, add, dot, vec
 
 # Rays whose cosine with the normal is smaller than this are taken as parallel and do not meet the plane.
 _PARALLEL = 1e-9
@@ -149,10 +149,10 @@ class OutlineWarning(UserWarning):
 @jax.jit
 def _normal_and_point(
     slope: Float[Array, ""], aspect: Float[Array, ""], position: Float[Array, "2"], height: Float[Array, ""]
-) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
+) -> tuple[Float[Array, "3"], Vec]:
     s, a = jnp.deg2rad(slope), jnp.deg2rad(aspect)
     upward = jnp.stack([jnp.sin(s) * jnp.sin(a), jnp.sin(s) * jnp.cos(a), jnp.cos(s)])
-    return upward, jnp.stack([position[0], position[1], height])
+    return upward, (position[0], position[1], height)
 
 
 @final
@@ -162,7 +162,8 @@ class Plane(AbstractShape):
     **Arguments:**
 
     - `upward`: (3,) upper unit normal.
-    - `foot`: (3,) a point of the plane, m.
+    - `foot`: (3,) a point of the plane, m, or its x, y and z. It is kept as three arrays: for derivatives, a
+      change of the height alone is one number (`trace.derivatives.replay`).
 
     **Example:**
 
@@ -173,7 +174,7 @@ class Plane(AbstractShape):
     """
 
     upward: Float[Array, "3"]
-    foot: Float[Array, "3"]
+    foot: Vec = eqx.field(converter=vec)
 
     @staticmethod
     def of(
@@ -201,7 +202,7 @@ class Plane(AbstractShape):
         return False
 
     def moved(self, by: Float[Array, "3"]) -> "Plane":
-        return Plane(self.upward, self.foot + by)
+        return Plane(self.upward, add(self.foot, vec(by)))
 
     def distance(self, x: Vec, w: Vec) -> Scalar:
         normal, offset = self.tangent(x)
@@ -210,7 +211,8 @@ class Plane(AbstractShape):
         return jnp.where((jnp.abs(cosine) >= _PARALLEL) & (s > 0), jnp.minimum(s, FAR), FAR)
 
     def tangent(self, x: Vec) -> tuple[Vec, Scalar]:
-        return vec(self.upward), jnp.sum(self.upward * self.foot)
+        normal = vec(self.upward)
+        return normal, dot(normal, self.foot)
 
     def crossing(
         self, points: Float[np.ndarray | Array, "n 3"], directions: Float[np.ndarray | Array, "n 3"]

@@ -238,7 +238,7 @@ class Terrain(AbstractGround):
         half = 0.5 * (np.asarray(self.heights.shape) - 1.0)
         middle = jnp.asarray(self.origin, float) + self.spacing * half
         upward = normalise((-east, -north, jnp.ones_like(mean)))
-        return Plane(jnp.stack(upward), jnp.append(middle, mean))
+        return Plane(jnp.stack(upward), (middle[0], middle[1], mean))
 
     def _best_fit(self, heights: Any, spacing: Any) -> tuple[tuple[Any, Any], Any]:
         """Fit a plane by least squares: its rise per m to the east and to the north, and its mean height."""

@@ -12,8 +12,8 @@ nor with that of orders up to 256.
 
 - forward: those of the function itself, and what `add_tangents` adds,
 - reverse, with respect to extinction: by the replay,
-- reverse, with respect to everything else (heights, sizes, laws): those that JAX derives, chunk by chunk; or,
-  where few numbers of the device scene vary, directional derivatives by forward mode, which compile faster.
+- reverse, with respect to everything else (heights, sizes, laws): those that JAX derives, chunk by chunk,
+- with respect to few numbers of the device scene: directional derivatives, taken together with the trace.
 """
 
 import dataclasses
@@ -28,6 +28,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Int
 
 from jaxlidar._jax.mesh_axes import varies
+from jaxlidar._jax.products import tensordot
 from jaxlidar._vectors import Scalar, Vec
 from jaxlidar.trace.derivatives.linear_map import linear_map
 from jaxlidar.trace.device_scene import DeviceScene
@@ -37,7 +38,8 @@ Traced = TypeVar("Traced")
 Numbers = TypeVar("Numbers")
 
 # Directional derivatives compile faster than reverse mode, whose backward pass repeats the steps of paths,
-# but take longer the more numbers of the device scene vary. The height of a plane is three: a point of it.
+# but take longer the more numbers of the device scene vary. A plane has four beside its place: its normal and
+# its height.
 _MAX_DIRECTIONS = 4
 
 
@@ -56,7 +58,8 @@ class ExtinctionTables(NamedTuple):
     def of(scene: DeviceScene) -> "ExtinctionTables":
         """Return the tables of a scene themselves."""
         medium = scene.medium
-        assert medium is not None
+        if medium is None:
+            return ExtinctionTables(None, None, None, None)
         return ExtinctionTables(medium.leaf, medium.bark, medium.total, scene.depth_above)
 
     def add_tables(
@@ -123,10 +126,10 @@ def with_replay(
     - `add_tangents`: adds to a tangent of the result of `trace` what `pull_back` has and forward mode lacks,
       from tangents of the tables of extinction. Default None: forward mode lacks nothing.
 
-    Scenes without voxels are traced as they are; so are those without derivatives or with forward ones alone,
-    those with score functions, and those that vary along axes of a mesh.
+    Scenes without derivatives or with forward ones alone are traced as they are; so are those with score
+    functions, and those that vary along axes of a mesh.
     """
-    if scene.medium is None or not scene.reverse or scene.slopes is not None or varies((scene, numbers)):
+    if not scene.reverse or scene.slopes is not None or varies((scene, numbers)):
         return trace(scene, numbers)
     arrays, static = eqx.partition((scene, numbers), eqx.is_array)
     leaves, treedef = jax.tree.flatten(arrays)
@@ -142,6 +145,39 @@ def with_replay(
     numbered: Any = eqx.combine(jax.tree.unflatten(treedef, range(len(leaves))), static)[0]
     tables: Any = ExtinctionTables.of(numbered)
 
+    def function_of(leaves: list[Array], varying: list[int]) -> Callable[[list[Array]], Traced]:
+        """Return the trace as a function of the leaves that vary, with all derivatives."""
+        return lambda values: trace(*scene_and_numbers(_replaced(leaves, varying, values), "all"))
+
+    def is_few(leaves: list[Array], varying: list[int]) -> bool:
+        """Return True for leaves of few numbers, none of them in the tables of extinction."""
+        return not set(varying) & set(tables) and 0 < sum(leaves[i].size for i in varying) <= _MAX_DIRECTIONS
+
+    def linearised(leaves: list[Array], varying: list[int]) -> tuple[Traced, Callable[[list[Array]], Traced]]:
+        """Return the trace, and its tangent as a function of those of few leaves: a sum over their numbers.
+
+        The derivatives by each number are taken here, together with the trace. The sum is transposed in
+        reverse mode, and nothing is traced again.
+        """
+        numbers, to_values = ravel_pytree([leaves[i] for i in varying])
+        of_varying = function_of(leaves, varying)
+
+        def along(direction: Float[Array, "numbers"]) -> tuple[Traced, Traced]:
+            return jax.jvp(lambda numbers: of_varying(to_values(numbers)), (numbers,), (direction,))
+
+        # One direction is no batch, which would take twice the time.
+        if numbers.size == 1:
+            result, derivative = along(jnp.ones_like(numbers))
+            derivatives = jax.tree.map(lambda d: d[None], derivative)
+        else:
+            directions = jnp.eye(numbers.size, dtype=numbers.dtype)
+            result, derivatives = jax.vmap(along, out_axes=(None, 0))(directions)
+
+        def push(tangents: list[Array]) -> Traced:
+            return jax.tree.map(lambda d: tensordot(ravel_pytree(tangents)[0], d, 1), derivatives)
+
+        return result, push
+
     def pull_back_leaves(leaves: list[Array], varying: list[int], cotangent: Traced) -> list[Array]:
         """Return the cotangents of leaves: of tables of extinction by the replay, of others by JAX."""
         by_leaf: dict[int, Any] = {}
@@ -150,17 +186,12 @@ def with_replay(
             by_leaf = {number: c for number, c in zip(tables, pulled) if number is not None}
         others = [number for number in varying if number not in tables]
         if others:
-            values = [leaves[number] for number in others]
-            in_directions = sum(a.size for a in values) <= _MAX_DIRECTIONS
-
-            def of_others(values: list[Array]) -> Traced:
-                return trace(*scene_and_numbers(_replaced(leaves, others, values), "all"))
-
-            if in_directions:
-                pulled_others = _pull_back_in_directions(of_others, values, cotangent)
+            values = [leaves[i] for i in others]
+            if is_few(leaves, others):
+                pull_back_others = jax.linear_transpose(linearised(leaves, others)[1], values)
             else:
-                pulled_others = jax.vjp(of_others, values)[1](cotangent)[0]
-            by_leaf |= dict(zip(others, pulled_others))
+                pull_back_others = jax.vjp(function_of(leaves, others), values)[1]
+            by_leaf |= dict(zip(others, pull_back_others(cotangent)[0]))
         return [by_leaf[number] for number in varying]
 
     @jax.custom_jvp
@@ -169,11 +200,14 @@ def with_replay(
 
     def push_forward(primals: tuple[list[Array]], tangents: tuple[list[Any]]) -> tuple[Traced, Traced]:
         leaves, tangent = primals[0], tangents[0]
-        varying = [
-            i
-            for i, (a, t) in enumerate(zip(leaves, tangent))
-            if not isinstance(t, SymbolicZero) and jnp.issubdtype(a.dtype, jnp.inexact)
-        ]
+        varying = _varying(leaves, tangent)
+        tangents_of_varying = [tangent[i] for i in varying]
+        if is_few(leaves, varying):
+            result, push = linearised(leaves, varying)
+            return result, push(tangents_of_varying)
+        if scene.medium is None:
+            of_varying = function_of(leaves, varying)
+            return jax.jvp(of_varying, ([leaves[i] for i in varying],), (tangents_of_varying,))
         result = differentiable(leaves)
         results, result_structure = jax.tree.flatten(result)
 
@@ -197,7 +231,6 @@ def with_replay(
         def transpose(leaves: list[Array], cotangents: list[Array]) -> list[Array]:
             return pull_back_leaves(leaves, varying, jax.tree.unflatten(result_structure, cotangents))
 
-        tangents_of_varying = [tangent[i] for i in varying]
         result_tangent = linear_map(function, transpose, leaves, tangents_of_varying, results)
         return result, jax.tree.unflatten(result_structure, result_tangent)
 
@@ -205,18 +238,13 @@ def with_replay(
     return differentiable(leaves)
 
 
-def _pull_back_in_directions(
-    function: Callable[[list[Array]], Traced], values: list[Array], cotangent: Traced
-) -> list[Array]:
-    """Return the cotangents of values: the directional derivative by each number times the cotangent."""
-    numbers, to_values = ravel_pytree(values)
-
-    def of_number(direction: Float[Array, "numbers"]) -> Float[Array, ""]:
-        tangent = jax.jvp(function, (values,), (to_values(direction),))[1]
-        products = jax.tree.map(lambda c, t: jnp.sum(c * t), cotangent, tangent)
-        return sum(jax.tree.leaves(products), jnp.zeros((), numbers.dtype))
-
-    return to_values(jax.vmap(of_number)(jnp.eye(numbers.size, dtype=numbers.dtype)))
+def _varying(leaves: list[Array], tangents: list[Any]) -> list[int]:
+    """Return the positions of leaves of real numbers whose tangents are not zero throughout."""
+    return [
+        i
+        for i, (a, t) in enumerate(zip(leaves, tangents))
+        if not isinstance(t, SymbolicZero) and jnp.issubdtype(a.dtype, jnp.inexact)
+    ]
 
 
 def _replaced(values: list[Array], numbers: list[int], replacements: list[Array]) -> list[Array]:
