@@ -73,6 +73,13 @@ def _array_text(array: np.ndarray) -> str:
     return f"{shape} values from {number_text(values.min())} to {number_text(values.max())}"
 
 
+def samples_text(time: np.ndarray) -> str:
+    """Describe the even samples of a record by their times, ns."""
+    if time.size == 1:
+        return f"1 sample at {time[0]:.6g} ns"
+    return f"{time.size} samples of {time[1] - time[0]:.3g} ns from {time[0]:.6g} ns"
+
+
 def percent(fraction: float) -> str:
     """Format a fraction in percent with two significant digits."""
     # Rounded as text first, as "g" alone writes 100 as 1e+02.

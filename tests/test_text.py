@@ -10,7 +10,7 @@ import pytest
 
 import jaxlidar as jl
 from jaxlidar._fields.checks import check_range
-from jaxlidar._text import number_text, object_text
+from jaxlidar._text import number_text, object_text, samples_text
 
 
 @pytest.mark.parametrize(
@@ -56,6 +56,11 @@ def test_objects_print_their_values():
     for printed in (str(lidar), text, str(survey)):
         assert "f32[" not in printed
         assert max(map(len, printed.splitlines())) <= 100
+
+
+def test_one_sample_has_no_interval():
+    assert samples_text(np.array([5.0])) == "1 sample at 5 ns"
+    assert samples_text(np.array([5.0, 5.5, 6.0])) == "3 samples of 0.5 ns from 5 ns"
 
 
 def test_traced_values_print_as_tracers():

@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxlidar._text import NOTABLE_FRACTION, percent
+from jaxlidar._text import NOTABLE_FRACTION, percent, samples_text
 from jaxlidar.spectral.apply_optics import unfollowed_return
 
 
@@ -29,9 +29,7 @@ def summary(wave: Any) -> str:
     """Describe a waveform in a few lines: its samples, energy budget and accuracy; many scenes in one."""
     wavelengths, total = np.asarray(wave.wavelength, float), np.asarray(wave.reflectance).sum(axis=-1)
     n_columns = min(len(wavelengths), 4)
-    time = np.asarray(wave.time, float)
-    interval = time[1] - time[0] if time.size > 1 else 0.0
-    samples = f"{time.size} samples of {interval:.3g} ns from {time[0]:.6g} ns"
+    samples = samples_text(np.asarray(wave.time, float))
     if wave.has_scenes:
         return f"{len(wave)} waveforms of {samples}, at {', '.join(f'{w:g}' for w in wavelengths)} nm"
     title = f"Waveform of {samples}"

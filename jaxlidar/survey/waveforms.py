@@ -14,7 +14,7 @@ from jaxlidar._fields.checks import check_index, check_numbers
 from jaxlidar._fields.crs import common_system
 from jaxlidar._not_kept import NotKept
 from jaxlidar._registry import detect_returns, true_returns
-from jaxlidar._text import NOTABLE_FRACTION, percent
+from jaxlidar._text import NOTABLE_FRACTION, percent, samples_text
 from jaxlidar.formats.las import LasWriter
 from jaxlidar.formats.las_waveforms import write_las_waveforms
 from jaxlidar.progress import ProgressOption, shows_progress
@@ -164,9 +164,7 @@ class Waveforms(eqx.Module):
         return len(self.position)
 
     def __str__(self) -> str:
-        interval = self.time[1] - self.time[0] if self.time.size > 1 else 0.0
-        samples = f"{self.time.size} samples of {interval:.3g} ns from {self.time[0]:.6g} ns"
-        lines = [f"{len(self)} waveforms of {samples}"]
+        lines = [f"{len(self)} waveforms of {samples_text(self.time)}"]
         if not isinstance(self.reflectance, NotKept):
             for w, sums in zip(self.wavelength, self.reflectance.sum(axis=2).T):
                 low, middle, high = np.quantile(sums, (0.0, 0.5, 1.0))
