@@ -37,8 +37,8 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
     **Returns:** a context manager that gives the path to write to. It has the name of `path`, in a temporary
     folder that only this user can read.
 
-    **Raises:** OSError where the file cannot be written or is write-protected, and for block devices and
-    sockets.
+    **Raises:** OSError where the file cannot be written or is write-protected, for a path without a name, for
+    block devices and sockets, and, when the block has ended with a file, for a folder.
 
     **Example:**
 
@@ -60,6 +60,9 @@ def atomic_writes(*paths: str | os.PathLike[str]) -> Iterator[list[Path]]:
 
     Threads that write the same files do not mix theirs. Otherwise as `atomic_write`.
     """
+    for path in paths:
+        if not Path(path).name:
+            raise OSError(errno.EINVAL, "no name of a file", os.fspath(path))
     with contextlib.ExitStack() as stack:
         targets = [_target(Path(path)) for path in paths]
         drafts = [
@@ -72,6 +75,10 @@ def atomic_writes(*paths: str | os.PathLike[str]) -> Iterator[list[Path]]:
             # Without the lock: a pipe waits until it is read.
             if stream:
                 _copy(draft, target)
+        for path, draft, target in zip(paths, drafts, targets):
+            # A rename would name the draft, of which the user knows nothing.
+            if target.is_dir() and not draft.is_dir():
+                raise IsADirectoryError(errno.EISDIR, "a folder, not a file", os.fspath(path))
         with _COMMIT_LOCK:
             for draft, target, stream in zip(drafts, targets, is_stream):
                 if not stream:
