@@ -11,7 +11,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from jaxlidar._fields.checks import warn_user
+from jaxlidar._fields.checks import check_kind, warn_user
 from jaxlidar._fingerprint import version_of
 from jaxlidar._registry import save_result
 from jaxlidar.formats.files import atomic_write
@@ -64,10 +64,11 @@ def save(result: Any, path: str | os.PathLike[str], case: Case | None = None) ->
 
     **Returns:** nothing.
 
-    **Raises:** TypeError for an object that no file can hold, or whose scene has classes of your own.
-    ImportError where xarray, and h5netcdf or zarr, are not installed. ValueError for a case of other
-    wavelengths or shots, and where a folder of that name exists that is no Zarr store, or the store of a run
-    that has not ended. OSError for a path that cannot be written, or that a run has open.
+    **Raises:** TypeError for an object that no file can hold, or whose scene has classes of your own, and for
+    a `case` of another class. ImportError where xarray, and h5netcdf or zarr, are not installed. ValueError
+    for a case of other wavelengths or shots, and where a folder exists whose name is that of a Zarr store,
+    but which is none, or the store of a run that has not ended. OSError for a path that cannot be written, as
+    that of a folder, or that a run has open.
 
     **Example:**
 
@@ -80,10 +81,10 @@ def save(result: Any, path: str | os.PathLike[str], case: Case | None = None) ->
     >>> print(f"{float(jl.open(path).reflectance.sum()):.3f}")
     0.400
     """
+    check_kind("case", case, Case | None, "the jaxlidar.io.Case of the result, or None")
     if case is not None:
         _check_case(result, case)
-    path = Path(path)
-    with replacing(path):
+    with replacing(Path(path)):
         datasets = datasets_with_case(result, case)
         with atomic_write(path) as draft:
             write_groups(draft, datasets)
@@ -104,7 +105,11 @@ def _check_case(result: Any, case: Case) -> None:
     position = getattr(result, "position", None)
     if (case.survey is None) != (position is None):
         raise ValueError("a case with a survey belongs to Waveforms, one without to a Waveform")
-    if case.survey is not None and not np.array_equal(case.survey.position, np.asarray(position)):
+    if case.survey is None:
+        return
+    # Waveforms of a disturbed survey have the positions that it states.
+    stated = case.survey.position if case.survey.stated is None else case.survey.stated[:, :3]
+    if not np.array_equal(stated, np.asarray(position)):
         raise ValueError("the shots of the case have another position than the waveforms")
 
 

@@ -313,6 +313,17 @@ def test_a_folder_that_is_no_zarr_store_is_not_overwritten(wave, tmp_path):
     assert (folder / "thesis.txt").exists()
 
 
+def test_paths_that_are_no_files_are_named_as_they_were_given(wave, tmp_path, monkeypatch):
+    """Planted: the paths of drafts, which the user did not give."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "some_folder").mkdir()
+    with pytest.raises(OSError, match=r"no name of a file: ''$"):
+        wave.save("")
+    with pytest.raises(IsADirectoryError, match=r"a folder, not a file: 'some_folder'$"):
+        wave.save("some_folder")
+    assert [path.name for path in tmp_path.iterdir()] == ["some_folder"]
+
+
 class ShotEnergies(eqx.Module):
     """A result whose fields `energy` and `by_material` have a row for every shot."""
 

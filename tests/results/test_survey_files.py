@@ -62,6 +62,20 @@ def test_waveforms_are_saved_with_their_case_and_with_no_other(waveforms, tmp_pa
         waveforms[0].save(tmp_path / "shot.nc", case)
 
 
+def test_waveforms_of_a_disturbed_survey_are_saved_with_its_case(tmp_path):
+    """Their positions are those that it states; planted: the survey as it was before."""
+    flight = jl.Trajectory([0.0, 1.0], [(0, 0, 100), (0, 10, 100)])
+    lidar, scene = jl.Lidar(sensor=(0, 0, 0)), jl.Scene(ground=jl.Ground())
+    strip = jl.Survey.fly(flight, jl.Conical(5.0, 3.0), lidar=lidar, pulse_rate=2.0)
+    case = jl.io.Case(survey=strip.disturbed(position=0.05, key=KEY), scene=scene, key=KEY)
+    waveforms, path = case.simulate(), tmp_path / "strip.nc"
+    waveforms.save(path, case)
+    assert same(jl.io.read_case(path).survey, case.survey)
+    assert same(jl.rerun(path), waveforms)
+    with pytest.raises(ValueError, match="the shots of the case have another position"):
+        waveforms.save(path, dataclasses.replace(case, survey=strip.relative_to(np.ones(2))))
+
+
 class UserPulse(jl.AbstractPulse):
     """A pulse of a user's program, whose code a file cannot hold."""
 
