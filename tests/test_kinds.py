@@ -82,6 +82,10 @@ WRONG_KIND = {
     "jl.Canopy(voxels, leaf=leaf, sides=cube)": "sides is an array of float64; admissible is one of 'open'",
     "jl.leaf_surface('glass')": "n is a str; admissible are real numbers",
     "jl.first_return_window(np.arange(3.0), np.ones(3), 2.0, None)": "threshold is None; admissible are",
+    "jl.Survey.of(jl.Survey(jl.Lidar(), [(0, 0)]))": "lidar is a Survey; admissible is a Lidar",
+    "jl.Survey.join(None)": "surveys is None; admissible is a sequence of Survey",
+    "jl.Survey.join(jl.Survey(jl.Lidar(), [(0, 0)]))": "surveys is a Survey; admissible is a sequence of",
+    "jl.simulate(jl.Lidar(), jl.Scene(), key=jax.random.key(0)).save('a.nc', 'x')": "case is a str; admiss",
     "jl.Tree(*[[0.0]] * 9)": "start is a list; admissible is a NumPy array",
 }
 WRONG_SHAPE = {
@@ -120,6 +124,8 @@ WRONG_SHAPE = {
     "jl.voxelise(tree, 0.2, origin=(0, 0, 0), shape=(5.5, 5, 5))": "shape = 5.5 is outside the",
     "jl.voxelise_points(points[:, :2], 0.2, leaf_area=1.0)": "points has shape (4, 2); admissible",
     "jl.voxelise_points(points, 0.2, leaf_area=1.0, is_wood=np.ones(3, bool))": "is_wood has shape",
+    "jl.io.stack_shots([])": "shots is empty; admissible are one or more",
+    "jl.Terrain(cube[0], 1.0).height_at(np.zeros(3), np.zeros(2))": "y has shape (2,); admissible is (3,)",
     "tree.translated(1.0)": "offset has shape (); admissible is (3,)",
 }
 

@@ -20,7 +20,7 @@ from typing import Any, NamedTuple, overload
 import numpy as np
 from jaxtyping import Bool, Float, Int, Shaped
 
-from jaxlidar._fields.checks import as_numpy, check_number, check_numbers, check_shape
+from jaxlidar._fields.checks import as_numpy, check_index, check_number, check_numbers, check_shape
 from jaxlidar.formats.coordinates import is_angle
 from jaxlidar.formats.noise import NoiseLevels, above_pedestal, estimate_noise_levels
 
@@ -420,7 +420,7 @@ class AirborneShots(Sequence, abc.ABC):
     def __getitem__(self, index: int | slice) -> AirborneShot | list[AirborneShot]:
         if isinstance(index, slice):
             return [self[i] for i in range(*index.indices(len(self)))]
-        i = range(len(self))[index]
+        i = check_index("shot", index, len(self))
         # Levels of the file are replaced by those that it states for the shot.
         arguments: dict[str, Any] = {**self.levels._asdict(), "index": i, **self._read(i)}
         try:
@@ -478,6 +478,8 @@ def stack_shots(shots: Iterable[AirborneShot]) -> ShotStack:
      [2. 8. 5. 2.]]
     """
     shots = list(shots)
+    if not shots:
+        raise ValueError("shots is empty; admissible are one or more")
     steps = {shot.sampling_interval for shot in shots}
     if len(steps) != 1:
         raise ValueError(f"shots have the sampling intervals {sorted(steps)} ns; admissible is one")

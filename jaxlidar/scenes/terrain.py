@@ -187,10 +187,12 @@ class Terrain(AbstractGround):
 
         **Returns:** heights, m, shaped as `x` and `y`.
 
-        **Raises:** ValueError for positions off a terrain with open sides.
+        **Raises:** ValueError for positions off a terrain with open sides, and for two shapes.
         """
         check_numbers("x", x)
         check_numbers("y", y)
+        if np.ndim(x) and np.ndim(y):
+            check_shape("y", y, np.shape(x))
         values, origin = [concrete(v) for v in (x, y)], concrete(self.origin)
         if origin is None or values[0] is None or values[1] is None:
             terrain, east, north = self, jnp.asarray(x), jnp.asarray(y)

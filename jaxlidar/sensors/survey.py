@@ -15,7 +15,7 @@ import dataclasses
 import itertools
 import math
 import operator
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any, SupportsFloat, final
 
 import equinox as eqx
@@ -266,6 +266,7 @@ class Survey(eqx.Module):
     @staticmethod
     def of(lidar: Lidar) -> "Survey":
         """Make the survey of one shot: that of a lidar in its own place and direction."""
+        check_kind("lidar", lidar, Lidar, "a Lidar, as in Survey.of(Lidar())")
         place: dict[str, Any] = {
             "sensor" if lidar.has_sensor_position else "position": concrete_array(lidar.position)[None]
         }
@@ -294,6 +295,9 @@ class Survey(eqx.Module):
         >>> len(survey), survey.flight_line.tolist()
         (6, [1, 1, 1, 2, 2, 2])
         """
+        # A survey is iterable, too: its items are the lidars of its shots.
+        if isinstance(surveys, Survey) or not isinstance(surveys, Iterable):
+            raise TypeError(f"surveys is {kind_of(surveys)}; admissible is a sequence of Survey")
         surveys = list(surveys)
         if not surveys:
             raise ValueError("surveys is empty; admissible are one or more")

@@ -158,7 +158,8 @@ class Waveform(eqx.Module):
         **Returns:** a `DiscreteReturns` of one shot. Its ground height is that of the truth, NaN without one.
 
         **Raises:** as `Waveforms.returns`; TypeError for something else than a lidar, ValueError for a
-        lidar of other wavelengths.
+        lidar of other wavelengths, and for one that is placed by its altitude where that of the waveform was
+        placed by its sensor, or the other way round.
 
         **Example:**
 

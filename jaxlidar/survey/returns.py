@@ -510,6 +510,13 @@ def input_of_waveform(wave: Any, lidar: Any, wavelength: Any) -> DetectorInput:
             f"lidar has {np.asarray(lidar.wavelength).tolist()} nm, the waveform "
             f"{np.asarray(wave.wavelength).tolist()} nm"
         )
+    # Waveforms of earlier versions, and of JAX transformations, do not say where they were recorded.
+    if "altitude" in wave.info and (wave.info["altitude"] is None) != lidar.has_sensor_position:
+        kinds = ("its altitude", "its sensor")
+        raise ValueError(
+            f"lidar is placed by {kinds[lidar.has_sensor_position]}, that of the waveform by "
+            f"{kinds[not lidar.has_sensor_position]}; admissible is the lidar that was simulated"
+        )
     w = wavelength_index(wavelength, np.asarray(wave.wavelength, float))
     shot = Survey.of(lidar)
     acquisition = acquisition_of(shot)

@@ -153,7 +153,7 @@ def test_shots_are_a_sequence(written):
     assert [shot.index for shot in shots[1:]] == [1, 2]
     assert shots[-1].index == 2
     assert repr(shots) == "3 shots of small.pls"
-    with pytest.raises(IndexError):
+    with pytest.raises(IndexError, match="shot 3: there are 3; admissible are -3 to 2"):
         _ = shots[3]
 
 

@@ -255,6 +255,10 @@ def test_a_waveform_has_the_returns_of_its_shot(survey, waveforms):
     np.testing.assert_allclose(shot_returns.position, returns.position[rows], atol=1e-3)
     np.testing.assert_allclose(shot_returns.reflectance, returns.reflectance[rows], rtol=1e-3)
     assert shot_returns.material.tolist() == returns.material[rows].tolist()
+    with pytest.raises(
+        ValueError, match="lidar is placed by its sensor, that of the waveform by its altitude"
+    ):
+        waveforms[3].returns(survey[3].at((0.0, 0.0, 500.0)))
     truth = waveforms[3].true_returns(survey[3])
     np.testing.assert_allclose(truth.reflectance, waveforms.true_returns().reflectance[rows], rtol=1e-4)
 
