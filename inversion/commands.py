@@ -27,7 +27,15 @@ from inversion.fit.unknowns import Unknown
 from inversion.footprints import simulate_footprints
 from inversion.metrics.gedi_table import gedi_table
 from jaxlidar.cli.constants import INTERRUPTED, SUCCESS
-from jaxlidar.cli.shared import QUIET_OPTION, ResultPath, save_figure
+from jaxlidar.cli.shared import (
+    PLOT_OPTION,
+    QUIET_OPTION,
+    RESULT_SUFFIXES,
+    ResultPath,
+    check_suffix,
+    out_option,
+    save_figure,
+)
 from jaxlidar.formats.tables import TABLE_FORMATS
 from jaxlidar.results.store import remove_store, store_beside
 
@@ -91,11 +99,9 @@ def _parse_unknowns(ctx: Any, parameter: Any, texts: tuple[str, ...]) -> list[Un
 )
 @click.option("--noise", type=click.FloatRange(0, min_open=True), help="Standard deviation of the samples.")
 @click.option("--seed", type=click.IntRange(0, 2**31 - 1), default=0, help="Seed of the photons of the fit.")
-@click.option("-o", "--out", type=ResultPath(), help="Write the result as netCDF, or as Zarr (.zarr).")
-@click.option(
-    "--plot", type=click.Path(dir_okay=False, path_type=Path), help="Draw the fit and its residuals."
-)
-@click.option("--quiet", is_flag=True, help="Show no progress.")
+@out_option("Write the result as netCDF (.nc), or as Zarr (.zarr).", *RESULT_SUFFIXES)
+@PLOT_OPTION
+@QUIET_OPTION
 def retrieve(
     observed: Path,
     start: Path,
@@ -143,10 +149,7 @@ def retrieve(
 
 
 def _check_table_path(ctx: Any, parameter: Any, path: Path | None) -> Path | None:
-    """Refuse a name that ends in no format of tables, before the work."""
-    if path is not None and path.suffix.lower() not in TABLE_FORMATS:
-        raise click.BadParameter(f"{str(path)!r} ends in none of {', '.join(TABLE_FORMATS)}")
-    return path
+    return check_suffix(path, TABLE_FORMATS)
 
 
 @click.command()

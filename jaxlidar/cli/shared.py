@@ -1,7 +1,7 @@
 """Arguments, options, figures and progress bars that several commands have."""
 
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
@@ -11,8 +11,32 @@ from jaxlidar.io import atomic_write
 from jaxlidar.results.store import is_zarr
 
 CASE_ARGUMENT = click.argument("case", type=click.Path(dir_okay=False, path_type=Path), metavar="CASE.toml")
+# Endings of files of results, as `jaxlidar info` knows them.
+RESULT_SUFFIXES = (".nc", ".zarr")
+
+
+def check_suffix(path: Path | None, suffixes: Iterable[str]) -> Path | None:
+    """Refuse a name that ends in none of the suffixes, before any work. **Raises:** BadParameter."""
+    if path is not None and path.suffix.lower() not in suffixes:
+        raise click.BadParameter(f"{str(path)!r} ends in none of {', '.join(suffixes)}")
+    return path
+
+
+def _check_figure_path(ctx: Any, parameter: Any, path: Path | None) -> Path | None:
+    # A name without an ending, such as that of a device, is that of a PNG.
+    if path is None or not path.suffix:
+        return path
+    # matplotlib takes a while to import: only for a figure.
+    from matplotlib.backend_bases import FigureCanvasBase
+
+    return check_suffix(path, [f".{name}" for name in FigureCanvasBase.get_supported_filetypes()])
+
+
 PLOT_OPTION = click.option(
-    "--plot", type=click.Path(dir_okay=False, path_type=Path), help="Draw a figure (.png, .pdf, .svg)."
+    "--plot",
+    type=click.Path(dir_okay=False, path_type=Path),
+    callback=_check_figure_path,
+    help="Draw a figure (.png, .pdf, .svg).",
 )
 QUIET_OPTION = click.option("--quiet", is_flag=True, help="Show no progress.")
 
@@ -30,9 +54,13 @@ class ResultPath(click.Path):
         return path
 
 
-def out_option(help: str) -> Callable[[Any], Any]:
-    """Make the option `-o` with the given help."""
-    return click.option("-o", "--out", type=ResultPath(), help=help)
+def out_option(help: str, *suffixes: str) -> Callable[[Any], Any]:
+    """Make the option `-o` with the given help, for names with one of the suffixes, or for any name."""
+
+    def check(ctx: Any, parameter: Any, path: Path | None) -> Path | None:
+        return check_suffix(path, suffixes) if suffixes else path
+
+    return click.option("-o", "--out", type=ResultPath(), callback=check, help=help)
 
 
 def new_axes(width: float, height: float, **options: Any) -> Any:

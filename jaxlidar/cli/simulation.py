@@ -11,6 +11,7 @@ from jaxlidar.cli.shared import (
     CASE_ARGUMENT,
     PLOT_OPTION,
     QUIET_OPTION,
+    RESULT_SUFFIXES,
     new_axes,
     out_option,
     save_figure,
@@ -43,7 +44,7 @@ def read_complete_case(path: Path, seed: int | None = None, rtol: float | None =
 
 @click.command()
 @CASE_ARGUMENT
-@out_option("Write the waveform, with its case, as netCDF, or as Zarr (.zarr).")
+@out_option("Write the waveform, with its case, as netCDF (.nc), or as Zarr (.zarr).", *RESULT_SUFFIXES)
 @PLOT_OPTION
 @click.option(
     "--seed", type=click.IntRange(0, 2**31 - 1), help="Seed of the photons, in place of the file's."

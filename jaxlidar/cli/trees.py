@@ -25,7 +25,7 @@ POSITIVE = click.FloatRange(0, min_open=True)
 @click.option("--voxel-size", type=POSITIVE, default=0.25, help="Edge of the voxels, m.")
 @click.option("--leaf-area", type=POSITIVE, help="Leaf area of the tree, m2.  [default: that of its clumps]")
 @click.option("--leafless", is_flag=True, help="Grow the tree without leaves.")
-@out_option("Write a scene of the tree over soil as NAME.toml and NAME.npz.")
+@out_option("Write a scene of the tree over soil as NAME.toml and NAME.npz.", ".toml")
 @PLOT_OPTION
 def tree(
     habit: str,
@@ -45,8 +45,6 @@ def tree(
       jaxlidar tree conifer --seed 3 --height 25 -o spruce.toml
       jaxlidar simulate spruce.toml
     """
-    if out is not None and out.suffix != ".toml":
-        raise click.BadParameter(f"{out} does not end in .toml", param_hint="--out")
     grown = grow(HABITS[habit](**({} if height is None else {"height": height})), seed=seed)
     grown = grown.leafless() if leafless else grown
     buds = len(grown.bud_radius)

@@ -247,6 +247,20 @@ def test_inadmissible_arguments_are_refused_in_a_sentence(argv, status, message,
     assert message in " ".join(capsys.readouterr().err.split())
 
 
+@pytest.mark.parametrize(
+    ("option", "name", "message"),
+    [
+        ("--plot", "a.xyz", "a.xyz' ends in none of .eps, "),
+        ("-o", "a.txt", "a.txt' ends in none of .nc, .zarr"),
+        ("-o", "a", "a' ends in none of .nc, .zarr"),
+    ],
+)
+def test_names_of_no_known_ending_are_refused_before_the_work(option, name, message, tmp_path, capsys):
+    # The case, which does not exist, would be read next.
+    assert cli.main(["simulate", "nowhere.toml", option, str(tmp_path / name)]) == 2
+    assert message in " ".join(capsys.readouterr().err.split())
+
+
 def test_figures_are_written_by_their_ending(tmp_path):
     assert cli.main(["spectra", "soil", "--plot", str(tmp_path / "a.pdf")]) == 0
     assert (tmp_path / "a.pdf").read_bytes().startswith(b"%PDF")
