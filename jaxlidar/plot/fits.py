@@ -6,15 +6,19 @@ from typing import Any
 import numpy as np
 from jaxtyping import ArrayLike
 from matplotlib.axes import Axes
+from matplotlib.lines import Line2D
 
 from jaxlidar._fields.checks import as_numpy, check_number
 from jaxlidar.plot.style import (
     TOTAL_COLOUR,
-    WAVELENGTH_COLOURS,
+    add_wavelength_bar,
     check_waveform,
     limit_height,
     make_axes,
+    wavelength_bar_width,
+    wavelength_colours,
     wavelength_rows,
+    write_note,
 )
 from jaxlidar.spectral.waveform import Waveform
 
@@ -34,7 +38,7 @@ def residuals(
     **Arguments:**
 
     - `wave`: the simulated `Waveform`, such as that of a fit.
-    - `observed`: (wavelengths, bins) apparent reflectance at the waveform's samples.
+    - `observed`: (wavelengths, bins) apparent reflectance at the waveform's samples; NaN is left blank.
     - `noise`: its standard deviation, a number or of the same shape, positive.
     - `ax`: the axes to draw on. Default None: those of a new figure.
     - `wavelength`: in nm, one of the waveform's. Default None: all.
@@ -68,14 +72,14 @@ def residuals(
         raise ValueError(f"noise = {np.min(sigma):g} is outside the admissible range (0, inf)")
     check_number("limit", limit, 0.0, low_open=True)
     rows = wavelength_rows(wave, wavelength)
-    ax = make_axes(ax, (2.2, 4.2))
+    wavelengths = [float(wave.wavelength[i]) for i in rows]
+    ax = make_axes(ax, (2.2 + wavelength_bar_width(wavelengths), 4.2))
     height = np.asarray(wave.height)
     residual = (data - np.asarray(wave.reflectance)) / sigma
     for half_width, opacity in ((2.0, 0.12), (1.0, 0.15)):
         ax.axvspan(-half_width, half_width, color=TOTAL_COLOUR, alpha=opacity, linewidth=0)
     ax.axvline(0.0, color=TOTAL_COLOUR, linewidth=0.6)
-    for number, i in enumerate(rows):
-        colour = TOTAL_COLOUR if len(rows) == 1 else WAVELENGTH_COLOURS[number % len(WAVELENGTH_COLOURS)]
+    for i, colour in zip(rows, wavelength_colours(wavelengths)):
         points = {"color": colour, "marker": "o", "markersize": 2.0, "linestyle": "none", **style}
         if len(rows) > 1:
             points.setdefault("label", f"{float(wave.wavelength[i]):g} nm")
@@ -89,13 +93,13 @@ def residuals(
                 height[beyond],
                 **{**points, "marker": marker, "label": "_"},
             )
-    limit_height(ax, height, np.maximum(np.asarray(wave.reflectance), data)[rows])
+    if np.isnan(residual[rows]).all():
+        write_note(ax, "no values")
+    limit_height(ax, height, np.fmax(np.asarray(wave.reflectance), data)[rows])
     ax.set_xlim(-limit, limit)
     ax.set_xlabel("residual\n(standard deviations)")
-    if len(rows) > 1:
-        ax.legend(
-            loc="lower center", bbox_to_anchor=(0.5, 1.0), frameon=False, fontsize="small", markerscale=3
-        )
+    if "color" in style or not add_wavelength_bar(ax, wavelengths):
+        _add_legend(ax, markerscale=3, ncols=2)
     return ax
 
 
@@ -134,26 +138,38 @@ def fit(
     >>> print([text.get_text() for text in left.get_legend().get_texts()])
     ['observed', 'fitted']
     """
+    check_waveform(wave)
+    rows, height = wavelength_rows(wave, wavelength), np.asarray(wave.height)
+    wavelengths = [float(wave.wavelength[i]) for i in rows]
     if axes is None:
         from matplotlib import pyplot
 
-        axes = pyplot.subplots(1, 2, figsize=(6.0, 4.2), sharey=True, layout="constrained")[1]
+        size = (6.0 + wavelength_bar_width(wavelengths), 4.2)
+        axes = pyplot.subplots(1, 2, figsize=size, sharey=True, layout="constrained")[1]
     assert axes is not None
     if len(axes) != 2:
         raise ValueError(f"axes has {len(axes)} axes; admissible are 2")
     waveform_axes, residual_axes = axes
     residuals(wave, observed, noise, residual_axes, wavelength=wavelength, limit=limit)
     residual_axes.set_ylabel("")
-    rows, height = wavelength_rows(wave, wavelength), np.asarray(wave.height)
     data, model = as_numpy(observed, "observed"), np.asarray(wave.reflectance)
-    for number, i in enumerate(rows):
-        is_one_of_many = len(rows) > 1
-        colour = WAVELENGTH_COLOURS[number % len(WAVELENGTH_COLOURS)] if is_one_of_many else TOTAL_COLOUR
-        suffix = f", {float(wave.wavelength[i]):g} nm" if is_one_of_many else ""
-        points = {"marker": "o", "markersize": 2.5, "linestyle": "none", "markerfacecolor": "none"}
-        waveform_axes.plot(data[i], height, color=colour, label=f"observed{suffix}", **points)
-        waveform_axes.plot(model[i], height, color=colour, linewidth=1.0, label=f"fitted{suffix}")
-    limit_height(waveform_axes, height, np.maximum(model, data)[rows])
+    looks: dict[str, dict[str, Any]] = {
+        "observed": {"marker": "o", "markersize": 2.5, "linestyle": "none", "markerfacecolor": "none"},
+        # Of a single sample there is no line.
+        "fitted": {"linewidth": 1.0, "marker": "x" if height.size == 1 else ""},
+    }
+    for i, colour in zip(rows, wavelength_colours(wavelengths)):
+        for (name, look), values in zip(looks.items(), (data[i], model[i])):
+            waveform_axes.plot(values, height, color=colour, label=name, **look)
+    limit_height(waveform_axes, height, np.fmax(model, data)[rows])
     waveform_axes.set_xlabel("apparent reflectance\nper sample")
-    waveform_axes.legend(frameon=False, fontsize="small", loc="lower center", bbox_to_anchor=(0.5, 1.0))
+    # The residuals name the colours of wavelengths.
+    handles = [Line2D([], [], color=TOTAL_COLOUR, label=name, **look) for name, look in looks.items()]
+    _add_legend(waveform_axes, handles=handles)
     return axes
+
+
+def _add_legend(ax: Axes, **options: Any) -> None:
+    """Add a legend above the axes, if they have anything to name."""
+    if "handles" in options or ax.get_legend_handles_labels()[0]:
+        ax.legend(frameon=False, fontsize="small", loc="lower center", bbox_to_anchor=(0.5, 1.0), **options)

@@ -9,6 +9,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from jaxlidar.plot.fits import residuals
+from jaxlidar.plot.style import wavelength_bar_width
 from jaxlidar.plot.waveforms import waveform
 from jaxlidar.spectral.waveform import Waveform
 
@@ -17,7 +18,8 @@ RESOLUTION = 80  # dots per inch
 
 def waveform_html(wave: Waveform) -> str:
     """Render the summary of a waveform and its figure as HTML."""
-    figure = Figure(figsize=(3.0, 3.2), layout="constrained")
+    bar = wavelength_bar_width(np.asarray(wave.wavelength))
+    figure = Figure(figsize=(3.0 + bar, 3.2), layout="constrained")
     axes = waveform(wave, figure.subplots())
     axes.set_xlabel(axes.get_xlabel(), loc="left")
     return _side_by_side(str(wave), figure)
@@ -25,7 +27,8 @@ def waveform_html(wave: Waveform) -> str:
 
 def fit_html(summary: str, wave: Waveform, residual: Any) -> str:
     """Render the summary of a fit, the fitted waveform and residuals (in standard deviations) as HTML."""
-    figure = Figure(figsize=(5.0, 3.2), layout="constrained")
+    bar = wavelength_bar_width(np.asarray(wave.wavelength))
+    figure = Figure(figsize=(5.0 + 2.0 * bar, 3.2), layout="constrained")
     waveform_axes, residual_axes = figure.subplots(1, 2, sharey=True)
     waveform(wave, waveform_axes)
     # At the left, as the axis has its power of ten at the right end.

@@ -15,6 +15,7 @@ from jaxlidar.plot.style import (
     WAVELENGTH_COLOURS,
     check_waveform,
     make_axes,
+    write_note,
 )
 from jaxlidar.progress import Progress
 from jaxlidar.spectral.waveform import Waveform
@@ -67,10 +68,14 @@ def energy_budget(wave: Waveform, ax: Axes | None = None, *, legend: bool = True
         style = {"color": colour, "hatch": hatch, "edgecolor": "white", "linewidth": 0.5, "label": name}
         ax.barh(names, percentage, left=bar_end, **style)
         bar_end = bar_end + percentage
+    if not bar_end.any():
+        # Bars of no length name the wavelengths.
+        ax.barh(names, bar_end)
+        write_note(ax, "no light")
     ax.set_xlim(0.0, 100.0)
     ax.invert_yaxis()
     ax.set_xlabel("share of the emitted light (%)")
-    if legend:
+    if legend and bar_end.any():
         position = {"loc": "lower center", "bbox_to_anchor": (0.5, 1.0), "ncols": 3}
         ax.legend(frameon=False, fontsize="small", handlelength=1.2, columnspacing=1.2, **position)
     return ax

@@ -50,8 +50,8 @@ def photons(
 
     **Returns:** the axes.
 
-    **Raises:** ValueError for distances or labels of another shape, and labels outside 0 to 3; TypeError for
-    objects of the wrong type.
+    **Raises:** ValueError for no event, for distances or labels of another shape, and labels outside 0 to 3;
+    TypeError for objects of the wrong type.
 
     **Example:**
 
@@ -66,6 +66,8 @@ def photons(
     ['noise', 'signal']
     """
     check_kind("events", events, PhotonEvents | PhotonTrack, "PhotonEvents or a PhotonTrack")
+    if len(events.height) == 0:
+        raise ValueError("events has no event; admissible is one or more")
     if isinstance(events, PhotonTrack):
         if distance is not None:
             raise ValueError(
@@ -99,7 +101,6 @@ def photons(
     has_shots = distance is None and not isinstance(events, PhotonTrack)
     ax.set_xlabel("shot" if has_shots else "distance along the track (m)")
     ax.set_ylabel("height (m)")
-    if ax.lines:
-        # Beside the axes: within them it would cover photons.
-        ax.legend(markerscale=2.0, frameon=False, loc="center left", bbox_to_anchor=(1.0, 0.5))
+    # Beside the axes: within them it would cover photons.
+    ax.legend(markerscale=2.0, frameon=False, loc="center left", bbox_to_anchor=(1.0, 0.5))
     return ax

@@ -10,7 +10,7 @@ from jaxlidar._fields.checks import as_numpy
 from jaxlidar.optics.leaf import LeafOptics
 from jaxlidar.optics.prospect import Prospect
 from jaxlidar.optics.spectra import Spectrum
-from jaxlidar.plot.style import WAVELENGTH_COLOURS, make_axes
+from jaxlidar.plot.style import WAVELENGTH_COLOURS, make_axes, point_marker
 
 # Wavelengths of leaf spectra, nm: the range of the coefficients of PROSPECT.
 LEAF_WAVELENGTHS = np.arange(400.0, 2501.0, 2.0)
@@ -49,12 +49,15 @@ def spectrum(
     colour = WAVELENGTH_COLOURS[len(ax.lines) % len(WAVELENGTH_COLOURS)]
     if isinstance(source, Spectrum):
         grid = as_numpy(source.wavelength if wavelength is None else wavelength, "wavelength")
-        line = {"color": colour, "label": source.name or "reflectance", **style}
+        line = {"color": colour, "label": source.name or "reflectance", **point_marker(grid.size), **style}
         ax.plot(grid, np.asarray(source(grid)), **line)
     else:
         grid = LEAF_WAVELENGTHS if wavelength is None else as_numpy(wavelength, "wavelength")
-        for values, linestyle, name in zip(source(grid), ("-", "--"), ("reflectance", "transmittance")):
-            line = {"color": colour, "linestyle": linestyle, "label": name, **style}
+        # Single points, which have no dashes, differ by how they are filled.
+        looks = ("reflectance", "-", "full"), ("transmittance", "--", "none")
+        for values, (name, linestyle, fill) in zip(source(grid), looks):
+            line: dict[str, Any] = {"color": colour, "linestyle": linestyle, "label": name}
+            line |= {"fillstyle": fill, **point_marker(grid.size), **style}
             ax.plot(grid, np.broadcast_to(np.asarray(values), grid.shape), **line)
     ax.set_xlabel("wavelength (nm)")
     ax.set_ylabel("reflectance" if isinstance(source, Spectrum) else "reflectance, transmittance")

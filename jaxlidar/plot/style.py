@@ -10,6 +10,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import Normalize, to_hex
 from matplotlib.ticker import MaxNLocator
 
 from jaxlidar._fields.checks import check_kind, check_number
@@ -30,6 +32,8 @@ OTHER_COLOUR = "#999999"
 TOTAL_COLOUR = "#1A1A1A"
 BEAM_COLOUR = "#D55E00"
 WAVELENGTH_COLOURS = ("#0072B2", "#D55E00", "#CC79A7", "#009E73", "#E69F00", "#56B4E9")
+# Least share of the shorter side of a map in the longer one: labels need room.
+_MIN_MAP_SHARE = 0.4
 # Figures show the heights at which the waveform exceeds this fraction of its peak.
 VISIBLE_FRACTION = 0.004
 
@@ -81,8 +85,45 @@ def wavelength_rows(wave: Waveform | Waveforms, wavelength: float | None) -> Seq
     return [int(rows[0])]
 
 
+def wavelength_colours(wavelengths: Sequence[float]) -> list[str]:
+    """Return a colour for each wavelength: black for one, distinct ones for a few, and a scale for more."""
+    if len(wavelengths) == 1:
+        return [TOTAL_COLOUR]
+    if len(wavelengths) <= len(WAVELENGTH_COLOURS):
+        return list(WAVELENGTH_COLOURS[: len(wavelengths)])
+    return [to_hex(colour) for colour in _wavelength_scale(wavelengths).to_rgba(np.asarray(wavelengths))]
+
+
+def wavelength_bar_width(wavelengths: Sequence[float] | np.ndarray) -> float:
+    """Return the width in inches that the colour bar of wavelengths takes, zero where there is none."""
+    return 0.9 if len(wavelengths) > len(WAVELENGTH_COLOURS) else 0.0
+
+
+def add_wavelength_bar(ax: Axes, wavelengths: Sequence[float]) -> bool:
+    """Add the colour bar of more wavelengths than have distinct colours, and return True if there is one."""
+    if not wavelength_bar_width(wavelengths):
+        return False
+    ax.figure.colorbar(_wavelength_scale(wavelengths), ax=ax, label="wavelength (nm)")
+    return True
+
+
+def _wavelength_scale(wavelengths: Sequence[float]) -> ScalarMappable:
+    return ScalarMappable(Normalize(min(wavelengths), max(wavelengths)), "viridis")
+
+
+def point_marker(count: int) -> dict[str, Any]:
+    """Return the style that makes a line of one point visible; none is needed for more points."""
+    return {"marker": "o", "markersize": 4.0} if count == 1 else {}
+
+
+def write_note(ax: Axes, text: str) -> None:
+    """Write why axes are empty, in their middle."""
+    ax.text(0.5, 0.5, text, transform=ax.transAxes, ha="center", va="center", color=TOTAL_COLOUR)
+
+
 def limit_height(ax: Axes, height: Float[np.ndarray, " bins"], total: np.ndarray) -> None:
     """Set the limits of the height axis around the visible signal of any of the waveforms, and label it."""
+    total = np.nan_to_num(total, nan=0.0)
     peak = np.max(total, axis=-1, keepdims=True)
     # The floor keeps a waveform of zeros from counting as visible everywhere.
     visible = height[np.any(total > VISIBLE_FRACTION * np.maximum(peak, 1e-300), axis=0)]
@@ -103,12 +144,18 @@ class _UpperTicks(MaxNLocator):
 
 
 def label_map(ax: Axes) -> None:
-    """Set equal scales and the labels of a map."""
+    """Set equal scales and the labels of a map, which is widened if it is a strip."""
     ax.set_aspect("equal")
-    # Map coordinates have seven digits: few ticks, none with an offset or an exponent, and none at the lower
-    # left, where both axes would have one.
-    ax.xaxis.set_major_locator(MaxNLocator(nbins=4))
-    ax.yaxis.set_major_locator(_UpperTicks(nbins=4))
+    limits = np.array([ax.get_xlim(), ax.get_ylim()])
+    least = _MIN_MAP_SHARE * float(np.ptp(limits, axis=1).max())
+    for (low, high), axis, locator in zip(limits, "xy", (MaxNLocator, _UpperTicks)):
+        is_strip = high - low < least
+        if is_strip:
+            middle = 0.5 * (low + high)
+            ax.set(**{f"{axis}lim": (middle - 0.5 * least, middle + 0.5 * least)})
+        # Map coordinates have seven digits: few ticks, none with an offset or an exponent, and none at the
+        # lower left, where both axes would have one.
+        getattr(ax, f"{axis}axis").set_major_locator(locator(nbins=2 if is_strip else 4))
     ax.ticklabel_format(style="plain", useOffset=False)
     ax.tick_params(axis="y", labelrotation=90)
     ax.set_xlabel("x, east (m)")

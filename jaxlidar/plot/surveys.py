@@ -9,7 +9,7 @@ from matplotlib.collections import EllipseCollection
 from matplotlib.colors import LightSource, LinearSegmentedColormap
 
 from jaxlidar._fields.checks import as_numpy, check_kind, check_range, check_shape
-from jaxlidar.plot.style import BEAM_COLOUR, MATERIAL_COLOURS, label_map, make_axes
+from jaxlidar.plot.style import BEAM_COLOUR, MATERIAL_COLOURS, label_map, make_axes, write_note
 from jaxlidar.scenes.scene import Scene
 from jaxlidar.scenes.terrain import Terrain
 from jaxlidar.sensors.survey import Survey
@@ -41,7 +41,7 @@ def survey(
     - `scene`: the `Scene` below. Default None: not drawn.
     - `ax`: the axes to draw on. Default None: those of a new figure.
     - `values`: (shots,) numbers that colour the footprints, such as heights that were retrieved; NaN is left
-      blank. Default None: outlines alone.
+      blank; where all are NaN, outlines are drawn, and a note. Default None: outlines alone.
     - `label`: name of the values at their colour bar. Default "".
 
     **Returns:** the axes.
@@ -84,6 +84,10 @@ def survey(
     ax.set_ylim(low[1] - margin, high[1] + margin)
     label_map(ax)
     colour_values = None if values is None else _checked_values(values, len(survey))
+    if colour_values is not None and np.isnan(colour_values).all():
+        # Outlines, and no colour bar, whose numbers would be made up.
+        write_note(ax, "no values")
+        colour_values = None
     if float(np.max(radius)) < _MIN_FOOTPRINT * float(np.max(high - low)):
         colours = BEAM_COLOUR if colour_values is None else colour_values
         footprints: Any = ax.scatter(*position.T, s=4.0, c=colours, linewidths=0)

@@ -21,11 +21,14 @@ from jaxlidar.plot.style import (
     OTHER_COLOUR,
     TOTAL_COLOUR,
     VISIBLE_FRACTION,
-    WAVELENGTH_COLOURS,
+    add_wavelength_bar,
     check_waveform,
     limit_height,
     make_axes,
     material_colours,
+    point_marker,
+    wavelength_bar_width,
+    wavelength_colours,
     wavelength_rows,
 )
 from jaxlidar.spectral.waveform import Waveform
@@ -51,7 +54,8 @@ def waveform(
     """Draw a waveform, height upward.
 
     For one wavelength: the total as a line, the return of each material as an area from zero, and the light
-    that was scattered more than once as a dashed line. For several wavelengths: the totals.
+    that was scattered more than once as a dashed line. For several wavelengths: the totals; those of more
+    than six are coloured by their wavelength, with a colour bar in place of the legend.
 
     **Arguments:**
 
@@ -86,15 +90,16 @@ def waveform(
     check_waveform(wave)
     check_number("sigma", sigma, 0.0)
     rows = wavelength_rows(wave, wavelength)
-    ax = make_axes(ax, (3.5, 4.2))
+    wavelengths = [float(wave.wavelength[i]) for i in rows]
+    ax = make_axes(ax, (3.5 + wavelength_bar_width(wavelengths), 4.2))
     height = np.asarray(wave.height)
     total = np.asarray(wave.reflectance if quantity == "reflectance" else wave.energy)
     # The standard error is that of the reflectance; this factor converts it to the quantity drawn.
     conversion = total / np.where(np.asarray(wave.reflectance) > 0, np.asarray(wave.reflectance), np.inf)
     stderr = np.asarray(wave.stderr) * conversion
     is_single = len(rows) == 1
-    for number, i in enumerate(rows):
-        default_colour = TOTAL_COLOUR if is_single else WAVELENGTH_COLOURS[number % len(WAVELENGTH_COLOURS)]
+    marker = point_marker(height.size)
+    for i, default_colour in zip(rows, wavelength_colours(wavelengths)):
         colour = style.get("color", default_colour)
         if is_single and components and quantity == "reflectance":
             _draw_components(ax, wave, i)
@@ -103,7 +108,7 @@ def waveform(
                 low, high = total[i] - half_width * stderr[i], total[i] + half_width * stderr[i]
                 ax.fill_betweenx(height, low, high, color=colour, alpha=opacity, linewidth=0)
         name = ("total" if is_single else f"{float(wave.wavelength[i]):g} nm") if label is None else label
-        ax.plot(total[i], height, **{"color": colour, "linewidth": 1.4, "label": name, **style})
+        ax.plot(total[i], height, **{"color": colour, "linewidth": 1.4, "label": name, **marker, **style})
     limit_height(ax, height, total[rows])
     if not np.any(total[rows] < 0):
         ax.set_xlim(left=0.0)
@@ -116,13 +121,15 @@ def waveform(
     )
     if is_single:
         ax.set_title(f"{float(wave.wavelength[rows[0]]):g} nm", fontsize="medium")
-    ax.legend(frameon=False, fontsize="small")
+    if "color" in style or label is not None or not add_wavelength_bar(ax, wavelengths):
+        ax.legend(frameon=False, fontsize="small")
     return ax
 
 
 def _draw_components(ax: Axes, wave: Waveform, i: int) -> None:
     """Draw the returns of materials, the strongest one below the others, and of higher orders."""
     height = np.asarray(wave.height)
+    marker = point_marker(height.size)
     names = [n for n in wave.components if n not in _ORDERS]
     peaks = {n: float(np.max(np.asarray(wave.components[n][i]), initial=0.0)) for n in names}
     colours = material_colours(names)
@@ -131,7 +138,7 @@ def _draw_components(ax: Axes, wave: Waveform, i: int) -> None:
             component = np.asarray(wave.components[name][i])
             colour = colours[name]
             ax.fill_betweenx(height, 0.0, component, color=colour, alpha=0.45, linewidth=0, label=name)
-            ax.plot(component, height, color=colour, linewidth=0.8)
+            ax.plot(component, height, color=colour, linewidth=0.8, **marker)
     higher = np.asarray(wave.components["higher"][i])
     if np.any(higher > 0):
         ax.plot(
@@ -141,6 +148,7 @@ def _draw_components(ax: Axes, wave: Waveform, i: int) -> None:
             linewidth=1.0,
             linestyle=(0, (4, 2)),
             label="scattered twice\nor more",
+            **marker,
         )
 
 
@@ -226,7 +234,9 @@ def waterfall(
         for colour, values in areas.values() or [(OTHER_COLOUR, power[i, shown])]:
             edge = places[i] + scale * values
             ax.fill_betweenx(height[shown], places[i], edge, color=colour, alpha=0.6, linewidth=0)
-        ax.plot(places[i] + scale * power[i, shown], height[shown], color=TOTAL_COLOUR, linewidth=0.5)
+        marker = point_marker(height.size)
+        edge = places[i] + scale * power[i, shown]
+        ax.plot(edge, height[shown], color=TOTAL_COLOUR, linewidth=0.5, **marker)
         drawn_materials |= {n: colour for n, (colour, _) in areas.items()}
         lowest, highest = min(lowest, height[shown].min()), max(highest, height[shown].max())
     ground = np.asarray(waves.ground_height, float)[rows]

@@ -90,6 +90,72 @@ def test_empty_and_noisy_waveforms_are_drawn(wave, axes):
     assert axes.get_xlim()[0] < 0
 
 
+def one_sample(wave):
+    """Return the largest sample of a waveform as a waveform."""
+    i = int(np.argmax(wave.reflectance[1]))
+    return jax.tree.map(lambda a: a[..., i : i + 1] if a.shape[-1:] == wave.time.shape else a, wave)
+
+
+def test_single_points_have_markers(wave):
+    """Planted: lines of one point, which are not seen."""
+    single = one_sample(wave)
+    drawn = [
+        plot.waveform(single, Figure().subplots(), wavelength=1064.0),
+        plot.spectrum(jl.Prospect(), Figure().subplots(), wavelength=[1064.0]),
+        plot.spectrum(jl.spectrum("soil-medium"), Figure().subplots(), wavelength=[1064.0]),
+        plot.fit(single, single.reflectance, 0.1, Figure().subplots(1, 2), wavelength=1064.0)[0],
+    ]
+    for axes in drawn:
+        assert axes.lines
+        assert all(line.get_marker() not in ("", "None") for line in axes.lines)
+
+
+def test_many_wavelengths_have_a_colour_each_and_a_bar():
+    """Planted: six colours in turn, and legends that leave the axes no room, of which matplotlib warns."""
+    from matplotlib import pyplot
+
+    lidar = jl.Lidar(wavelength=np.linspace(450.0, 2300.0, 12))
+    wave = jl.simulate(lidar, jl.Scene(ground=jl.Ground()), key=jax.random.key(0))
+    axes = plot.waveform(wave)
+    assert len({line.get_color() for line in axes.lines}) == 12
+    assert axes.get_legend() is None
+    assert axes.figure.axes[1].get_ylabel() == "wavelength (nm)"
+    pair = plot.fit(wave, 1.01 * wave.reflectance, 0.001)
+    assert [text.get_text() for text in pair[0].get_legend().get_texts()] == ["observed", "fitted"]
+    assert len({line.get_color() for line in pair[0].lines}) == 12
+    for figure in (axes.figure, pair[0].figure):
+        figure.canvas.draw()
+        assert min(ax.get_window_extent().height for ax in figure.axes) > 0.6 * figure.bbox.height
+        pyplot.close(figure)
+
+
+def texts_of(axes):
+    return [text.get_text() for text in axes.texts]
+
+
+def test_figures_without_anything_to_draw_say_so(wave):
+    missing = np.full(wave.reflectance.shape, np.nan)
+    axes = plot.residuals(wave, missing, 0.1, Figure().subplots())
+    assert texts_of(axes) == ["no values"]
+    # A missing sample is left blank: neither the others nor the limits of heights depend on it.
+    part = np.array(wave.reflectance)
+    part[:, 3] = np.nan
+    axes = plot.residuals(wave, part, 0.1, Figure().subplots())
+    whole = plot.residuals(wave, wave.reflectance, 0.1, Figure().subplots())
+    assert texts_of(axes) == []
+    assert axes.get_ylim() == whole.get_ylim()
+    survey = jl.Survey.grid(jl.Lidar(), low=(0, 0), high=(10, 10), spacing=10.0)
+    axes = plot.survey(survey, ax=Figure().subplots(), values=np.full(4, np.nan))
+    assert texts_of(axes) == ["no values"]
+    assert len(axes.figure.axes) == 1
+    axes = plot.energy_budget(jax.tree.map(lambda a: 0.0 * a, wave), Figure().subplots())
+    assert texts_of(axes) == ["no light"]
+    dark = eqx.tree_at(lambda w: w.energy, wave, 0.0 * wave.energy)
+    events = jl.PhotonCounter().count(dark, key=jax.random.key(0))
+    with pytest.raises(ValueError, match="events has no event; admissible is one or more"):
+        plot.photons(events)
+
+
 def test_residuals_are_in_standard_deviations(wave, axes):
     observed = np.asarray(wave.reflectance) + 0.002
     observed[1, 5] += 1.0
@@ -220,6 +286,11 @@ def test_a_survey_is_drawn_where_its_beams_meet_the_terrain(axes):
     labels = [t.get_text() for t in axes.get_xticklabels()]
     assert 2 <= len(labels) <= 7
     assert all(len(label) == 6 and label.startswith(("4", "5")) for label in labels if label)
+    # A track is a strip, which leaves its labels room.
+    track = jl.Survey.track(jl.Lidar(), (5e5, 5.2e6), (5e5 + 4000.0, 5.2e6), 10.0)
+    strip = plot.survey(track, ax=Figure().subplots())
+    assert np.ptp(strip.get_ylim()) == pytest.approx(0.4 * np.ptp(strip.get_xlim()))
+    assert len([y for y in strip.get_yticks() if strip.get_ylim()[0] <= y <= strip.get_ylim()[1]]) <= 2
     # Shots of sensors that meet no ground are drawn as their sensors.
     sky = jl.Survey(jl.Lidar(), sensor=[(5.0, 6.0, 2.0)], zenith=150.0)
     ax = Figure().subplots()
