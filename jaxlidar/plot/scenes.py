@@ -13,9 +13,16 @@ from matplotlib.colors import LinearSegmentedColormap
 
 from jaxlidar.plot.style import BEAM_COLOUR, MATERIAL_COLOURS, make_axes
 from jaxlidar.scenes.scene import Scene
-from jaxlidar.scenes.surfaces import AbstractGround, AbstractSheet, AbstractSurface
+from jaxlidar.scenes.surfaces import AbstractGround, AbstractSurface
 from jaxlidar.scenes.terrain import Terrain
 from jaxlidar.sensors.lidar import Lidar
+from jaxlidar.sensors.survey import Survey
+
+# Least width of the axes over their height, where they show nothing but a beam, planes and terrain.
+_MIN_WIDTH = 0.6
+# Most metres along the horizontal of the path of a beam from its sensor, over the height of the scene, and
+# the height of a scene of less, m.
+_MAX_PATH, _MIN_HEIGHT = 4.0, 2.0
 
 
 def scene(
@@ -30,13 +37,16 @@ def scene(
 
     Leaf and bark are shaded by 1 - exp(-optical depth) of a horizontal view through all of the voxel map.
     Planes and terrain are cut at the middle of the map, of the meshes if there is no map, or of the
-    footprint. The figure takes in the map, all meshes and the footprint.
+    footprint or path of the beam. The figure takes in the map, all meshes and the footprint; or, of a lidar
+    that is placed by its sensor, the sensor and the path of its beam to the lowest or highest surface, the
+    canopy's top included, but not farther than four times the height of all of these.
 
     **Arguments:**
 
     - `scene`: a `Scene`.
-    - `lidar`: a `Lidar`, whose beam is drawn, out to 1/e^2 of the axial irradiance or to the edge of a
-      top-hat. Default None: no beam.
+    - `lidar`: a `Lidar`, whose beam is drawn as wide as it looks from the side, out to 1/e^2 of the axial
+      irradiance or to the edge of a top-hat; a dot marks a sensor that it is placed by. Default None: no
+      beam.
     - `ax`: the axes to draw on. Default None: those of a new figure.
     - `along`: the direction of view: "y" looks north, x to the right; "x" looks west, y to the right. Default
       "y".
@@ -62,13 +72,10 @@ def scene(
     centre = np.zeros(2) if lidar is None else np.asarray(lidar.position, dtype=float)[:2]
     # Boxes of what the figure shows, horizontally: lowest and highest corners.
     boxes, heights, entries = [], [], []
-    if lidar is not None:
-        reach = 1.3 * float(lidar.footprint_radius)
-        boxes.append((centre - reach, centre + reach))
-        heights += [float(lidar.sensor[2])] if lidar.altitude is None else []
     if scene.meshes:
         bounds = np.concatenate([mesh.bounds() for mesh in scene.meshes])
         boxes.append((bounds[:, 0, :2].min(axis=0), bounds[:, 1, :2].max(axis=0)))
+        heights += [bounds[:, 0, 2].min(), bounds[:, 1, 2].max()]
     if scene.canopy is not None:
         voxels = scene.canopy.voxels
         origin, size = np.asarray(voxels.origin, dtype=float), np.asarray(voxels.voxel_size, dtype=float)
@@ -79,6 +86,18 @@ def scene(
         extent = (origin[across], end[across], origin[2], end[2])
         entries += _draw_voxels(ax, voxels.leaf, "leaf", depth, size[depth], extent)
         entries += _draw_voxels(ax, voxels.bark, "bark", depth, size[depth], extent)
+    if lidar is not None:
+        levels = [*heights, *_heights_below(scene, across, centre)]
+        corners, beam_heights = _beam_box(lidar, levels)
+        heights += beam_heights
+        if not boxes:
+            # A narrow beam alone would make axes without room for their ticks.
+            spanned = [*levels, *beam_heights]
+            widening = 0.5 * _MIN_WIDTH * (max(spanned, default=0.0) - min(spanned, default=0.0))
+            middle_of_beam = corners.mean(axis=0)
+            corners[0] = np.minimum(corners[0], middle_of_beam - widening)
+            corners[1] = np.maximum(corners[1], middle_of_beam + widening)
+        boxes.insert(0, (corners[0], corners[1]))
     low, high = _extent(boxes, across)
     if isinstance(scene.ground, Terrain) and high <= low:
         # Without a canopy, meshes and a beam, the figure has the extent of the terrain.
@@ -92,14 +111,13 @@ def scene(
     profile = _ground_profile(scene.ground, sides, across, middle)
     for mesh in scene.meshes:
         outlines = mesh.corners()[:, :, [across, 2]]
-        heights += [outlines[..., 1].min(), outlines[..., 1].max()]
         style = {"facecolors": MATERIAL_COLOURS["mesh"], "linewidths": 0.2, "edgecolors": "white"}
         entries.append(ax.add_collection(PolyCollection(list(outlines), label="mesh", **style)))
-    for surface in scene.surfaces[: len(scene.surfaces) - sum(len(mesh.surfaces) for mesh in scene.meshes)]:
-        z = profile[1] if surface is scene.ground else _heights_at(surface, sides, across, middle)
+    heights += profile[1].tolist()
+    for plate in scene.plates:
+        z = _heights_at(plate, sides, across, middle)
         heights += z.tolist()
-        if isinstance(surface, AbstractSheet):
-            entries += ax.plot(sides, z, color=MATERIAL_COLOURS["plate"], linewidth=2.5, label="plate")
+        entries += ax.plot(sides, z, color=MATERIAL_COLOURS["plate"], linewidth=2.5, label="plate")
     bottom, top = min(heights, default=0.0), max(heights, default=0.0)
     margin = max(0.06 * (top - bottom), 0.2)
     if scene.ground is not None:
@@ -108,7 +126,8 @@ def scene(
         fill = {"color": MATERIAL_COLOURS["ground"], "linewidth": 0, "zorder": 3, "label": "ground"}
         entries.append(ax.fill_between(*profile, fill_bottom, **fill))
     if lidar is not None:
-        entries += _draw_beam(ax, lidar, across, bottom, top + 10 * margin)
+        length = 2.0 * (top - bottom + margin + np.linalg.norm(np.ptp(boxes[0], axis=0)) + high - low)
+        entries += _draw_beam(ax, lidar, across, (bottom, top + 10 * margin), length)
     ax.set_xlim(low, high)
     ax.set_ylim(bottom - margin, top + margin)
     ax.set_aspect("equal")
@@ -144,30 +163,69 @@ def _draw_voxels(
     return ax.plot([], [], "s", color=MATERIAL_COLOURS[name], label=name)
 
 
-def _draw_beam(ax: Axes, lidar: Lidar, across: int, bottom: float, top: float) -> list[Any]:
-    """Draw the edges of the beam in the plane through its axis, and return their entries for the legend."""
+def _heights_below(scene: Scene, across: int, place: np.ndarray) -> list[float]:
+    """Return the heights of the ground and of plates on the vertical line through a place (x, y)."""
+    sides, depth = place[[across, across]], float(place[1 - across])
+    profiles = [_ground_profile(scene.ground, sides, across, depth)[1]]
+    profiles += [_heights_at(plate, sides, across, depth) for plate in scene.plates]
+    return [float(z) for heights in profiles for z in heights[:1]]
+
+
+def _beam_box(lidar: Lidar, levels: list[float]) -> tuple[np.ndarray, list[float]]:
+    """Return the horizontal corners (2, 2) of what a beam takes, and the heights between which it lies.
+
+    That is the footprint on the reference plane. Of a lidar that is placed by its sensor, it is the path from
+    there to the lowest of the levels, or the highest one for a beam that goes up; heights are then its ends.
+    """
+    survey = Survey.of(lidar)
+    radius = 1.3 * float(survey.footprint_radius[0])
+    if not lidar.has_sensor_position:
+        reach = radius * np.linalg.norm(survey.level_footprint_axes, axis=0)[0]
+        return survey.position + [[-1.0], [1.0]] * reach, []
+    sensor, direction = survey.sensor[0], survey.direction[0]
+    height = max(float(np.ptp([*levels, sensor[2]])), _MIN_HEIGHT)
+    # To the level, or over the height of the scene where no level lies ahead.
+    level = min(levels, default=sensor[2]) if direction[2] < 0 else max(levels, default=sensor[2])
+    climb = level - sensor[2]
+    climb = climb if climb * direction[2] > 0 else np.copysign(height, direction[2])
+    longest = _MAX_PATH * height / max(float(np.hypot(*direction[:2])), 1e-9)
+    length = min(climb / direction[2] if direction[2] else longest, longest)
+    end = sensor + length * direction
+    # With room for the mark of the sensor.
+    reach = radius * length + 0.05 * height
+    ends = np.stack([sensor, end])
+    corners = np.stack([ends.min(axis=0) - reach, ends.max(axis=0) + reach])[:, :2]
+    return corners, [float(sensor[2]), float(end[2])]
+
+
+def _draw_beam(ax: Axes, lidar: Lidar, across: int, heights: tuple[float, float], length: float) -> list[Any]:
+    """Draw the edges of the beam as it looks from the side, and return their entries for the legend.
+
+    Beams of an altitude are drawn between the heights, those from a sensor over the length in m from there.
+
+    A point of the edge at the range r is r gamma / 2 (cos(t) a + sin(t) b) off the axis, with the semi-axes a
+    and b of the footprint over its radius. Along a unit vector u across the axis, in the plane of the figure,
+    the edge lies sqrt((a.u)^2 + (b.u)^2) r gamma / 2 off the axis.
+    """
     name = "beam (1/e²)" if lidar.profile == "gaussian" else "beam"
     style = {"color": BEAM_COLOUR, "linewidth": 1.0, "linestyle": (0, (4, 2)), "label": name}
-    if lidar.altitude is None:
-        # From the sensor on, as far as the figure may reach: limits cut it off.
-        sensor, direction = (np.asarray(a, dtype=float) for a in (lidar.sensor, lidar.direction))
-        start, towards = sensor[[across, 2]], direction[[across, 2]]
-        length = 2.0 * (abs(top - bottom) + abs(float(sensor[2])) + abs(float(np.ptp(ax.get_xlim()))))
-        slope = 0.5e-3 * float(lidar.divergence)
-        sideways = np.array([towards[1], -towards[0]])
-        ends = [start + length * (towards + side * slope * sideways) for side in (-1, 1)]
-        ax.fill(*np.array([start, *ends]).T, color=BEAM_COLOUR, alpha=0.07, linewidth=0)
-        return [line for end in ends for line in ax.plot(*np.array([start, end]).T, **style)]
-    z = np.array([bottom, top])
-    zenith, azimuth = np.deg2rad(float(lidar.zenith)), np.deg2rad(float(lidar.azimuth))
-    # Change of the horizontal position per metre of height.
-    lean = -np.tan(zenith) * (np.sin(azimuth), np.cos(azimuth))[across]
-    axis = float(lidar.position[across]) + lean * z
-    # The beam widens with the distance from the sensor.
-    widening = 1.0 - z / float(lidar.altitude)
-    # The footprint on a horizontal plane is longer along the direction of travel.
-    stretch = np.sqrt(1.0 + lean**2)
-    half_width = float(lidar.footprint_radius) * widening * stretch
+    survey, plane = Survey.of(lidar), [across, 2]
+    sensor, towards = survey.sensor[0, plane], survey.direction[0, plane]
+    steepness = float(np.linalg.norm(towards))
+    # A level beam along the view has no sides.
+    sideways = np.array([towards[1], -towards[0]]) / steepness if steepness > 1e-6 else np.zeros(2)
+    semi_axes = np.stack([axis[0, plane] for axis in survey.footprint_axes])
+    slope = 0.5e-3 * float(lidar.largest_divergence) * float(np.linalg.norm(semi_axes @ sideways))
+    if lidar.has_sensor_position:
+        # As far as the figure may reach: limits cut it off.
+        ends = [sensor + length * (towards + side * slope * sideways) for side in (-1, 1)]
+        ax.fill(*np.array([sensor, *ends]).T, color=BEAM_COLOUR, alpha=0.07, linewidth=0)
+        ax.plot(*sensor, "o", color=BEAM_COLOUR, markersize=4.0, label="_sensor", zorder=4)
+        return [line for end in ends for line in ax.plot(*np.array([sensor, end]).T, **style)]
+    z = np.array(heights)
+    axis = sensor[0] + (z - sensor[1]) * towards[0] / towards[1]
+    # On a level line the beam is wider than across its axis.
+    half_width = slope * (z - sensor[1]) / survey.direction[0, 2] * steepness / abs(towards[1])
     ax.fill_betweenx(z, axis - half_width, axis + half_width, color=BEAM_COLOUR, alpha=0.07, linewidth=0)
     return [line for side in (-1, 1) for line in ax.plot(axis + side * half_width, z, **style)]
 

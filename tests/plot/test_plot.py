@@ -203,6 +203,59 @@ def test_scene_from_the_east_and_of_a_tilted_beam(axes):
     assert np.allclose(lean, -np.tan(np.deg2rad(20.0)), rtol=1e-3)
 
 
+@pytest.mark.parametrize("along", ["x", "y"])
+@pytest.mark.parametrize("zenith", [0.0, 70.0, 90.0, 150.0])
+def test_a_beam_from_its_sensor_is_in_the_figure(axes, along, zenith):
+    """Planted: the width of the beam 1 m ahead of the sensor."""
+    scene = jl.Scene(ground=jl.Ground(), plates=(jl.Plate(3.0, 0.3),))
+    lidar = jl.Lidar(sensor=(40.0, 50.0, 1.7), zenith=zenith, azimuth=30.0)
+    plot.scene(scene, lidar, axes, along=along)
+    k = 0 if along == "y" else 1
+    direction = np.asarray(lidar.direction, float)
+    # To the ground, to the plate, or four times the height of the scene far.
+    length = {0.0: 1.7, 70.0: 1.7 / np.cos(np.deg2rad(70.0)), 90.0: 12.0, 150.0: 1.3 / np.cos(np.pi / 6)}
+    ends = np.array([40.0, 50.0])[k] + np.array([0.0, length[zenith] * direction[k]])
+    low, high = axes.get_xlim()
+    assert low < ends.min()
+    assert ends.max() < high
+    assert 1.79 < high - low < 2.0 + np.ptp(ends)
+    bottom, top = axes.get_ylim()
+    assert bottom < 0 < 3 < top < 4
+
+
+def test_a_beam_from_its_sensor_is_as_wide_from_the_side_as_from_behind(axes):
+    """Planted: edges that narrow where the beam travels along the view."""
+    lidar = jl.Lidar(sensor=(0.0, 0.0, 10.0), zenith=60.0, azimuth=10.0, divergence=50.0)
+    plot.scene(jl.Scene(ground=jl.Ground()), lidar, axes)
+    edges = [line.get_xydata() for line in axes.lines if line.get_label() == "beam (1/e²)"]
+    (start, first), (_, second) = edges
+    middle = 0.5 * (first + second)
+    length = np.linalg.norm(middle - start) / np.linalg.norm(np.asarray(lidar.direction)[[0, 2]])
+    assert np.linalg.norm(first - second) == pytest.approx(0.05 * length, rel=1e-4)
+
+
+@pytest.mark.parametrize("place", [{}, {"sensor": (0.0, 0.0, 1000.0)}])
+@pytest.mark.parametrize(
+    ("azimuth", "turn", "along", "width"),
+    [
+        # Seen northward, a beam that travels north shows its level axis, and from the east the other one.
+        (0.0, 0.0, "y", 8.0),
+        (0.0, 0.0, "x", 2.0),
+        (90.0, 0.0, "y", 2.0),
+        (0.0, 90.0, "y", 2.0),
+        (0.0, 45.0, "y", np.sqrt(0.5 * (8.0**2 + 2.0**2))),
+    ],
+)
+def test_an_elliptical_beam_is_as_wide_as_it_looks(axes, place, azimuth, turn, along, width):
+    """Planted: the longer axis for both."""
+    lidar = jl.Lidar(divergence=2.0, level_divergence=8.0, azimuth=azimuth, ellipse_turn=turn, **place)
+    plot.scene(jl.Scene(ground=jl.Ground()), lidar, axes, along=along)
+    edges = [line.get_xydata() for line in axes.lines if line.get_label() == "beam (1/e²)"]
+    # From the lower end, as heights must increase.
+    at_ground = [float(np.interp(0.0, *edge[np.argsort(edge[:, 1])].T[::-1])) for edge in edges]
+    assert abs(at_ground[1] - at_ground[0]) == pytest.approx(width, rel=1e-3)
+
+
 def test_terrain_is_drawn_at_the_middle_of_the_map(axes):
     heights = np.add.outer([0.0, 2.0, 1.0, 3.0], [0.0, 0.5])
     terrain = jl.Terrain(heights, (1.0, 3.0), (-1.5, -1.5))
