@@ -57,6 +57,12 @@ FAULTS = {
         "jnp.stack([-horizontal * jnp.sin(azimuth)",
         "trace/test_ground.py",
     ),
+    "the derivative by parameters of laws again where landings move": Fault(
+        "trace/device_scene.py",
+        "laws = jax.tree.map(jax.lax.stop_gradient, self.laws)",
+        "laws = self.laws",
+        "trace/test_derivatives_of_heights.py",
+    ),
     "paths in and out exchanged for the hot spot": Fault(
         "trace/first/first_order.py",
         "self.kappa = 1.0 if scene.config.hotspot else 2.0",

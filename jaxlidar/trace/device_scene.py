@@ -157,9 +157,14 @@ class DeviceScene(eqx.Module):
         return None if self.derivatives == "none" else last_scattering
 
     def direction_density(self, last_scattering: LastScattering, w: Vec) -> Scalar:
-        """Return the density (1/sr) with which photons would have been sent along `w`; at least 1e-6."""
-        density = _density(self.laws[0], last_scattering, w)
-        for number, law in enumerate(self.laws[1:], 1):
+        """Return the density (1/sr) with which photons would have been sent along `w`; at least 1e-6.
+
+        Its derivative is that by `w` alone: photons have that by the parameters of laws in their weight since
+        they were sent on.
+        """
+        laws = jax.tree.map(jax.lax.stop_gradient, self.laws)
+        density = _density(laws[0], last_scattering, w)
+        for number, law in enumerate(laws[1:], 1):
             density = jnp.where(last_scattering.law == number, _density(law, last_scattering, w), density)
         # A reparametrised direction may lie where the law sends nothing; the floor keeps the quotient of
         # densities finite.

@@ -320,3 +320,57 @@ def test_time_is_scaled_with_all_lengths():
     values, slopes = along_zero(far_lidar, scene_of)
     assert np.abs(slopes[0, 0]) < 1e-4 * values[0, 0]
     assert slopes[0, 1] == pytest.approx(values[0, 1], rel=1e-3)
+
+
+def test_the_anisotropy_of_leaves_above_ground_is_counted_once():
+    """Photons that leaves send to the ground under voxels: z-test against differences of converged means.
+
+    Planted: the derivative of their density twice, when they are sent on and when their landing points move.
+    """
+    voxels = jl.VoxelMap.from_lad(np.full((12, 12, 2), 0.4), voxel_size=1.0, origin=(-6.0, -6.0, 3.0))
+    lidar, ground, g, step = jl.Lidar(divergence=3.0), jl.Ground(reflectance=0.5), 0.3, 0.05
+
+    def scene_of(g):
+        return jl.Scene(canopy=jl.Canopy(voxels, leaf=jl.HenyeyGreenstein(0.8, g)), ground=ground)
+
+    plan = jl.plan(lidar, scene_of(g), max_orders=2, window=(-90.0, 80.0), n_photons=16384, n_rays=64)
+
+    @jax.jit
+    def value_and_derivative(g, key):
+        def from_ground(g):
+            wave = jl.simulate(lidar, scene_of(g), plan=plan, key=key)
+            return wave.components["ground"].sum()
+
+        return jax.jvp(from_ground, (g,), (1.0,))
+
+    keys = jax.random.split(jax.random.key(3), 16)
+    derivative = np.array([value_and_derivative(g, key)[1] for key in keys[:8]])
+    upper, lower = (
+        np.array([value_and_derivative(g + s, key)[0] for key in keys[8:]]) for s in (step, -step)
+    )
+    difference = (upper - lower) / (2.0 * step)
+    stderr = np.hypot(*(x.std(ddof=1) / np.sqrt(x.size) for x in (derivative, difference)))
+    assert abs(derivative.mean() - difference.mean()) < 4.0 * stderr
+    assert abs(2.0 * derivative.mean() - difference.mean()) > 20.0 * stderr
+
+
+@pytest.mark.parametrize("zenith", slow_unless([150.0], [150.0, 180.0]))
+def test_reverse_mode_is_forward_mode_for_a_sensor_below_its_canopy(zenith):
+    """Some photons meet nothing, and stay at the sensor: they have no direction to it."""
+    voxels = jl.VoxelMap.from_lad(
+        np.full((2, 2, 2), 0.5), voxel_size=(2.0, 2.0, 1.0), origin=(-2.0, -2.0, 3.0)
+    )
+    scene = jl.Scene(canopy=jl.Canopy(voxels, leaf=jl.LeafOptics(0.45, 0.4)))
+
+    def lidar_at(zenith):
+        return jl.Lidar(sensor=(0.3, 0.2, 0.5), zenith=zenith, azimuth=10.0, divergence=2.0)
+
+    plan = jl.plan(lidar_at(179.0), scene, max_orders=2, window=(0.0, 150.0), n_photons=2048, n_rays=64)
+
+    def higher(zenith):
+        wave = jl.simulate(lidar_at(zenith), scene, plan=plan, key=jax.random.key(0))
+        return wave.components["higher"].sum()
+
+    reverse, forward = (jax.jit(d(higher))(zenith) for d in (jax.grad, jax.jacfwd))
+    assert np.isfinite(forward)
+    np.testing.assert_allclose(reverse, forward, rtol=1e-3, atol=1e-9)

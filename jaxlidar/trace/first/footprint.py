@@ -105,12 +105,14 @@ class Beam(eqx.Module):
         return q / (1.0 + jnp.sqrt(jnp.maximum(1.0 + q / r, 1e-12)))
 
     def view(self, point: Vec) -> Vec:
-        """Unit vector from `point` to the sensor."""
+        """Unit vector from `point` to the sensor; zero at a sensor within the scene."""
         if self.return_direction is not None:
             return vec(jnp.broadcast_to(c, point[0].shape) for c in self.return_direction)
         if self.parallel:
             return vec(jnp.broadcast_to(-c, point[0].shape) for c in self.axis)
-        return normalise(add(scale(self.axis, -self.slant_range), scale(point, jnp.asarray(-1.0))))
+        to_sensor = scale(self._offset(point), jnp.asarray(-1.0))
+        # Photons that meet nothing may stay where they start. `excess` has a floor.
+        return scale(to_sensor, 1.0 / self.excess(point)) if self.from_sensor else normalise(to_sensor)
 
     def longest_flight(self, x: Vec, w: Vec, max_path: Scalar) -> Scalar:
         """Return how far, m, light may fly from `x` along `w` so that it can be back within `max_path` m.
