@@ -173,8 +173,8 @@ class GediShot:
 def read_gedi_l1b(path: str | os.PathLike[str], shot: Any = None) -> list[GediShot]:
     """Read the shots of a GEDI L1B file, or of a subset of one in the same layout.
 
-    This needs h5py (`pip install "jaxlidar[io]"`). From beams without a requested shot nothing is read but,
-    to find shots by number, the numbers.
+    This needs h5py (`pip install "jaxlidar[io]"`). From beams without a requested shot nothing is read but
+    the numbers of shots.
 
     Start indices are used where they fit the stored samples. Where they do not, as in subsets that kept the
     numbering of the full file, or are missing, the samples of shots follow one another without gaps, as many
@@ -189,7 +189,7 @@ def read_gedi_l1b(path: str | os.PathLike[str], shot: Any = None) -> list[GediSh
     - `path`: an HDF5 file.
     - `shot`: the requested shots, an integer or several. A number below the number of shots in the file is an
       index, from 0, into all shots, complete or not, beam after beam in the order of the file; any other is a
-      shot number. Default None: all.
+      shot number. One that is the index of a shot and the number of another is refused. Default None: all.
 
     **Returns:** a list of `GediShot`, in the order of `shot`; one integer gives a list of one.
 
@@ -312,20 +312,22 @@ def _select(path: Path, beams: "list[_Beam]", requested: list[int] | None) -> "l
     order = [(beam, i) for beam in beams for i in range(len(beam))]
     if requested is None:
         return order
-    by_number: dict[int, tuple[_Beam, int]] = {}
+    by_number = {int(n): (beam, i) for beam in beams for i, n in enumerate(beam.shot_number)}
     selected = []
     for number in requested:
-        if 0 <= number < len(order):
-            selected.append(order[number])
-            continue
-        if not by_number:
-            by_number = {int(n): (beam, i) for beam in beams for i, n in enumerate(beam.shot_number)}
-        if number not in by_number:
+        has_index = 0 <= number < len(order)
+        if not has_index and number not in by_number:
             raise ValueError(
                 f"{path}: shot = {number} is neither an index in [0, {len(order) - 1}] "
                 "nor the number of a shot here"
             )
-        selected.append(by_number[number])
+        shot = order[number] if has_index else by_number[number]
+        if by_number.get(number, shot) != shot:
+            raise ValueError(
+                f"{path}: shot = {number} is the number of a shot here and the index of another one; "
+                "admissible is None, which reads all shots: choose by their `shot_number`"
+            )
+        selected.append(shot)
     return selected
 
 

@@ -12,9 +12,16 @@ from typing import Any
 import numpy as np
 from jaxtyping import ArrayLike, Num
 
-from jaxlidar._fields.checks import as_numpy, check_number, check_range, check_shape, required_for
+from jaxlidar._fields.checks import (
+    as_numpy,
+    check_number,
+    check_range,
+    check_shape,
+    required_for,
+    warn_user,
+)
 from jaxlidar._fields.crs import CoordinateSystem, common_system, metric_system
-from jaxlidar.formats.checks import MAX_COORDINATE, existing_file
+from jaxlidar.formats.checks import MAX_COORDINATE, FileWarning, existing_file
 from jaxlidar.formats.coordinates import WKT_RECORD, check_elevations
 from jaxlidar.formats.files import atomic_write
 from jaxlidar.formats.las_header import PROJECTION_USER, LasHeader, read_header
@@ -209,7 +216,7 @@ def write_las(
 
     - `path`: the file, which ends in ".las" or ".laz". Missing folders are created.
     - `position`: (n, 3) m, at least one point. They are rounded to mm.
-    - `intensity`: (n,) from 0 to 65535, rounded to whole numbers. Default None: 0.
+    - `intensity`: (n,) counts from 0 to 65535, rounded to whole numbers. Default None: 0.
     - `return_number`, `number_of_returns`: (n,) whole numbers from 0 to 15. Default None: 1.
     - `gps_time`: (n,) s: of the GPS week where all are from 0 to 604,800, else adjusted standard GPS time
       (GPS time less 1e9 s); the header says which. Default None: 0.
@@ -222,6 +229,8 @@ def write_las(
       known. This needs pyproj.
 
     **Returns:** nothing.
+
+    **Warns:** `FileWarning` where all intensities are positive or 0 and round to 0.
 
     **Raises:** ImportError without laspy, without lazrs for LAZ, or without pyproj for `crs`. ValueError
     for another ending, arrays of different lengths, numbers outside their range, names and descriptions
@@ -333,7 +342,13 @@ class LasWriter:
         coordinates = as_numpy(position, "position")
         n = len(coordinates)
         if intensity is not None:
-            intensity = np.round(as_numpy(intensity, "intensity"))
+            intensity = as_numpy(intensity, "intensity")
+            if 0.0 < np.max(intensity, initial=0.0) < 0.5:
+                message = (
+                    f"{self.path}: intensity is at most {np.max(intensity):.2g}, and 0 when it is rounded"
+                )
+                warn_user(f"{message}: scale it to counts from 0 to 65535", FileWarning)
+            intensity = np.round(intensity)
         fields = {
             "intensity": np.zeros(n) if intensity is None else intensity,
             "return_number": np.ones(n, int) if return_number is None else return_number,

@@ -193,6 +193,11 @@ def write_gedi_l1b(
         "tx_egflag": np.ones(shots, np.uint8),
         "tx_pulseflag": np.ones(shots, np.uint8),
     }
+    if origin is not None and survey.crs is not None:
+        raise ValueError(
+            f"origin = {origin} is given with survey.crs = {survey.crs!r}; admissible is either: "
+            "positions of a coordinate reference system are not about an origin"
+        )
     if origin is None:
         crs = common_system({"survey": survey.crs, "crs": crs})
     projection = _projection(origin, crs)

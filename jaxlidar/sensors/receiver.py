@@ -41,7 +41,7 @@ from jaxlidar._fields.checks import (
 )
 from jaxlidar._fields.ranges import NANOMETRES, NOT_NEGATIVE, POSITIVE, check_ranges, quantity
 from jaxlidar._jax.products import einsum
-from jaxlidar._not_kept import check_kept
+from jaxlidar._not_kept import NotKept, check_kept
 from jaxlidar.sensors.photon_counter import (
     MAX_NEGATIVE_FRACTION,
     PhotonCounter,
@@ -137,7 +137,8 @@ def record(
       noise of its simulation: they send no photons.
     - `wavelength`: nm, one number or (wavelengths,), where `wave` is an array: a photon carries the energy
       h c / wavelength. Default None: the waveform's.
-    - `receiver`: the `Receiver` that records. Default None: one with its defaults.
+    - `receiver`: the `Receiver` that records, such as `lidar.receiver`. Default None: one with its defaults,
+      which is refused for a waveform that shows another one, by its `recorded` or, of a survey, its noise.
     - `key`: a JAX random key. With a key, samples are one realisation of the noise: the photons of signal and
       background are Poisson counts, or a normal variable of mean, variance and skewness of a Poisson count
       where more than 10,000 are expected; electronic noise is normal. Default None: the samples of the
@@ -152,7 +153,8 @@ def record(
     if it were absent (a straight-through estimate). They pass through the noise of a realisation with its
     draws held fixed, so not through Poisson counts.
 
-    **Raises:** ValueError where the energies have fewer than two axes, for infinite energies, for negative
+    **Raises:** ValueError where a waveform was recorded by a receiver that is not given, where the energies
+    have fewer than two axes, for infinite energies, for negative
     ones in an array, and where those of a waveform take more than 1 % from it; for wavelengths that are not
     positive, and for neither one nor one per row of the energies; for a noise model without a key, or that
     returns another shape than that of the energies; TypeError for an object of the wrong type. Inside a JAX
@@ -180,7 +182,10 @@ def record(
     wavelengths: Any = wave.wavelength if is_waveform else wavelength
     check_numbers("wavelength", wavelengths)
     energy, wavelength = as_array(energies, "energy"), as_array(wavelengths, "wavelength")
-    receiver = Receiver() if receiver is None else receiver
+    if receiver is None:
+        receiver = Receiver()
+        if is_waveform:
+            _check_recorded_by_default(wave, noise_model is not None)
     check_kind("receiver", receiver, Receiver, "a Receiver; a PhotonCounter counts by its method count")
     if energy.ndim < 2:
         raise ValueError(f"energy has shape {energy.shape}; admissible is (..., wavelengths, bins)")
@@ -204,6 +209,24 @@ def record(
     if samples.shape != energy.shape:
         raise ValueError(f"noise_model returns the shape {samples.shape}; admissible is {energy.shape}")
     return _quantise(samples, receiver)
+
+
+def _check_recorded_by_default(wave: Any, has_noise_model: bool) -> None:
+    """Refuse a waveform that shows a receiver other than the default, as far as its values are known.
+
+    The default one records the energies themselves, and no noise where there is no signal.
+    """
+    acquisition = getattr(wave, "acquisition", None)
+    shows_noise = acquisition is not None and bool(np.any(acquisition.noise > 0)) and not has_noise_model
+    recorded = getattr(wave, "recorded", None)
+    recorded = None if isinstance(recorded, NotKept) else concrete(recorded)
+    energy = concrete(wave.energy)
+    is_changed = not (recorded is None or energy is None or np.allclose(recorded, energy, 1e-5, 0.0, True))
+    if shows_noise or is_changed:
+        raise ValueError(
+            "receiver = None, but the waveform was recorded by one that is not the default; admissible is "
+            "that of its lidar, lidar.receiver, or another one, such as Receiver()"
+        )
 
 
 def _admissible_samples(energy: Array) -> Array:

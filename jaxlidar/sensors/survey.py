@@ -50,6 +50,8 @@ from jaxlidar.sensors.trajectory import Trajectory, body_rotation, rotation_matr
 # A length that falls short of a multiple of the spacing by this fraction, as by rounding, counts as the
 # multiple.
 _SPACING_TOLERANCE = 1e-6
+# Components of unit vectors below this are rounding.
+_ROUNDING = 1e-12
 # Point clouds number flight lines with 16 bits.
 MAX_FLIGHT_LINE = 2**16 - 1
 # Bytes of a shot while a survey is made: its position and direction, and the terms of their sums.
@@ -859,9 +861,11 @@ def _strip(
         sensor = sensor + turn @ lever_arm
     east, north, up = direction.T
     zenith, azimuth = beam_angles(direction)
-    # Positive to the right of the platform's heading.
+    # Positive to the right of the platform's heading. A level beam along it has none, and no rounding either.
     yaw = np.deg2rad(flight.yaw)
-    scan_angle = np.rad2deg(np.arctan2(east * np.cos(yaw) - north * np.sin(yaw), -up))
+    right = east * np.cos(yaw) - north * np.sin(yaw)
+    is_along = np.hypot(right, up) < _ROUNDING
+    scan_angle = np.where(is_along, 0.0, np.rad2deg(np.arctan2(right, -up)))
     order: dict[str, Any] = {"gps_time": flight.time, "scan_angle": scan_angle, "flight_line": flight_line}
     order |= {"crs": flight.crs, "attitude": np.stack([flight.roll, flight.pitch, flight.yaw], axis=1)}
     if lidar.level_divergence is not None:

@@ -77,8 +77,8 @@ class Waveform(eqx.Module):
     - `wavelength`: (wavelengths,) nm, the lidar's.
     - `info`: dict: "photons", "batches", "seconds" spent, "error" reached, and why the simulation "stopped":
       "nothing is random", "tolerance met", "batches spent" (with `n_photons`, or at the largest number of a
-      survey), "time spent", "interrupted", or "orders beyond ... may add ..."; and the "altitude" of the
-      lidar in m, None for one that is placed by its sensor.
+      survey), "time spent", "interrupted", "orders beyond ... may add ...", or, in a survey, "misses the
+      scene"; and the "altitude" of the lidar in m, None for one that is placed by its sensor.
     - `truth`: a `Truth`, what the beam meets in the scene; None where it was not asked for.
 
     The waveform of many scenes, as `simulate_scenes` returns it, has arrays with one more axis, the first, of

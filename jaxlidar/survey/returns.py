@@ -959,6 +959,9 @@ def returns_of(
     records = waves.recorded if is_own_record else np.asarray(record)
     if records.shape != shape:
         raise ValueError(f"record has shape {records.shape} at one wavelength; admissible is {shape}")
+    if not is_own_record:
+        # A sample that is not known would take all returns of its shot with it.
+        check_range("record", records)
     settings = _Settings(detector, float(fraction), *_limits(shape, background, noise, threshold))
     start_time, blocks = time.perf_counter(), []
     if is_own_record and settings.background is None:

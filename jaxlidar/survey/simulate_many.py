@@ -192,7 +192,7 @@ def simulate_many(
         off_map_fractions = off_map(strategy.survey, setup.scene)
         heights = ground_heights(strategy.survey, setup.scene, setup.plan.limits.start_distance)
         if hits is not None:
-            off_map_fractions = at_rows(hits, len(survey), off_map_fractions, 0.0)
+            off_map_fractions = off_map(survey, scene)
             heights = at_rows(hits, len(survey), heights, np.nan)
     # Tiles are parts of a stand, whose sides are not looked at.
     may_miss_plants = isinstance(scene, SceneParts) or (scene.canopy is not None and is_cut_off(scene.canopy))
@@ -209,6 +209,7 @@ def simulate_many(
     crs = common_system({"survey": survey.crs, "scene": scene.crs if isinstance(scene, Scene) else None})
     info: dict[str, Any] = {"automatic orders": max_orders is None, "narrow beams": is_narrow, "crs": crs}
     info |= {} if survey.stated is None else {"disturbed": True}
+    info |= {} if hits is None else {"missed": len(survey) - len(hits)}
     if path is None:
         results = SurveyResults.in_memory(strategy)
         _trace(results, key, run_tasks, progress)

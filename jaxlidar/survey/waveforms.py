@@ -10,11 +10,12 @@ import numpy as np
 from jaxtyping import ArrayLike, Float, Int
 
 from jaxlidar._constants import SPEED_OF_LIGHT
-from jaxlidar._fields.checks import check_index, check_numbers
+from jaxlidar._fields.checks import check_index, check_numbers, warn_user
 from jaxlidar._fields.crs import common_system
 from jaxlidar._not_kept import NotKept
 from jaxlidar._registry import detect_returns, true_returns
 from jaxlidar._text import NOTABLE_FRACTION, percent, samples_text
+from jaxlidar.formats.checks import FileWarning
 from jaxlidar.formats.las import LasWriter
 from jaxlidar.formats.las_waveforms import write_las_waveforms
 from jaxlidar.progress import ProgressOption, shows_progress
@@ -71,7 +72,8 @@ class Waveforms(eqx.Module):
     - `acquisition`: an `Acquisition`, what else discrete returns need; None for files of earlier versions.
     - `info`: dict of "rtol", "orders" followed, "automatic orders" (False where `max_orders` was given),
       "narrow beams" (True where all are narrower than a voxel), "altitude" of the lidar in m (None for
-      sensors), "crs" of the survey and its scene (None if unknown), "disturbed" (True for
+      sensors), "crs" of the survey and its scene (None if unknown), "missed" (number of shots that miss the
+      scene, where `beyond="miss"` left any empty), "disturbed" (True for
       `Survey.disturbed`), "seconds" that it took, and whether light was "shared" (over `SceneParts`: in all
       tiles). Over one scene with shared light, also the spacing in m of the "grid" of nodes at which it
       entered, and a bound on the fraction of samples that "parallel light" changes. Over `SceneParts`, also
@@ -171,6 +173,8 @@ class Waveforms(eqx.Module):
                 lines.append(f"  {w:g} nm: apparent reflectance {low:.3g} to {high:.3g}, median {middle:.3g}")
         if not_kept := [name for name in OPTIONAL_ARRAYS if isinstance(getattr(self, name), NotKept)]:
             lines.append(f"  not kept (keep=): {', '.join(not_kept)}")
+        if missed := self.info.get("missed"):
+            lines.append(f"  {missed} miss the scene, and are empty")
         if (n_off_map := int(np.sum(self.off_map >= NOTABLE_FRACTION))) > 0:
             lines.append(f"  {n_off_map} lie partly outside the voxel map")
         light = "which share light, " if self.info.get("shared") else ""
@@ -209,6 +213,8 @@ class Waveforms(eqx.Module):
 
         `unfollowed`: fraction of its light that orders beyond the last may add.
         """
+        if self.info.get("missed") and np.isnan(self.ground_height[i]):
+            return "misses the scene"
         # Standard errors are zero where nothing is random, and no photons are traced.
         if self.photons[i] == 0 and not np.any(self.stderr[i]):
             return StopReason.NOTHING_RANDOM.value
@@ -358,6 +364,9 @@ class Waveforms(eqx.Module):
 
         **Returns:** the `DiscreteReturns` that were written.
 
+        **Warns:** `FileWarning` where shots have more returns than the format holds, and `max_returns` is not
+        given.
+
         **Raises:** as `returns` and `DiscreteReturns.to_las`.
 
         **Example:**
@@ -370,9 +379,23 @@ class Waveforms(eqx.Module):
         >>> print(many.to_las(path, detector="leading edge"))
         2 returns of 2 shots: 2 ground
         """
-        returns = self.returns(detector, **{"max_returns": MAX_LAS_RETURNS, **options})
+        returns = self._returns_for_las(detector, options)
         returns.to_las(path, crs=crs, extra=extra)
         return returns
+
+    def _returns_for_las(self, detector: str | DetectorFunction, options: dict[str, Any]) -> DiscreteReturns:
+        """Detect returns, no more of a shot than the format holds; warn where there are."""
+        returns = self.returns(detector, **options)
+        if "max_returns" in options or len(returns) == 0 or returns.n_returns.max() <= MAX_LAS_RETURNS:
+            return returns
+        kept = self.returns(detector, **options, max_returns=MAX_LAS_RETURNS)
+        shots = len(np.unique(returns.shot[returns.n_returns > MAX_LAS_RETURNS]))
+        warn_user(
+            f"{len(returns) - len(kept)} of {len(returns)} returns are not written, the weakest of {shots} "
+            f"shots: LAS holds {MAX_LAS_RETURNS} of each; max_returns={MAX_LAS_RETURNS} asks for these",
+            FileWarning,
+        )
+        return kept
 
     def to_las_waveforms(
         self,
@@ -395,6 +418,8 @@ class Waveforms(eqx.Module):
 
         **Returns:** the `DiscreteReturns` that were written.
 
+        **Warns:** as `to_las`.
+
         **Raises:** as `returns` and `jaxlidar.io.write_las_waveforms`; ValueError for records without light.
 
         **Example:**
@@ -411,7 +436,7 @@ class Waveforms(eqx.Module):
         """
         wavelength, record = options.get("wavelength"), options.get("record")
         crs = common_system({"the simulation": self.crs, "crs": crs})
-        returns = self.returns(detector, **{"max_returns": MAX_LAS_RETURNS, **options})
+        returns = self._returns_for_las(detector, options)
         waves = input_of_waveforms(self, wavelength)
         records = waves.recorded if record is None else _at_wavelength(record, self.wavelength, wavelength)
         write_las_waveforms(path, airborne_shots(waves, records, returns, crs), point_format=point_format)

@@ -140,6 +140,17 @@ def test_shots_are_selected_by_index_or_number(small):
         read_gedi_l1b(small, np.array([0.5]))
 
 
+def test_a_number_that_may_mean_two_shots_is_refused(small):
+    """Planted: the shot with this index, whose number is another one."""
+    with h5py.File(small, "r+") as file:
+        file["BEAM0001/shot_number"][...] = [3, 2, 1]
+    message = r"shot = 2 is the number of a shot here and the index of another one; .* `shot_number`"
+    with pytest.raises(ValueError, match=message):
+        read_gedi_l1b(small, 2)
+    # No shot has this number.
+    assert read_gedi_l1b(small, 0)[0].shot_number == 3
+
+
 def test_shots_that_are_no_numbers(small):
     with pytest.raises(TypeError, match=r"shot = 'text' is a str; admissible are an index or a shot number"):
         read_gedi_l1b(small, "text")

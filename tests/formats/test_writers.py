@@ -20,7 +20,7 @@ import jaxlidar as jl
 from jaxlidar import cli
 from jaxlidar.cli.shared import new_axes, save_figure
 from jaxlidar.formats import files
-from jaxlidar.io import atomic_write
+from jaxlidar.io import FileWarning, atomic_write, read_las, write_las
 from tests.formats.test_las_waveforms import small_shots
 
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="links, pipes and modes of POSIX")
@@ -295,3 +295,12 @@ def test_processes_that_replace_one_folder_all_end_well(tmp_path):
     assert [process.returncode for process in processes] == [0, 0, 0]
     assert [path.name for path in tmp_path.iterdir()] == ["store"]
     assert (tmp_path / "store" / "content").read_text() == "complete"
+
+
+def test_intensities_that_all_round_to_zero_are_no_secret(tmp_path):
+    """Amplitudes in J, as of waveforms that were simulated."""
+    position, amplitude = np.zeros((2, 3)), np.array([4.8e-12, 1e-12])
+    with pytest.warns(FileWarning, match=r"intensity is at most 4\.8e-12, and 0 when it is rounded"):
+        write_las(tmp_path / "joule.las", position, intensity=amplitude)
+    write_las(tmp_path / "counts.las", position, intensity=1e14 * amplitude)
+    np.testing.assert_array_equal(read_las(tmp_path / "counts.las").intensity, [480, 100])

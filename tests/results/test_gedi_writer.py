@@ -284,6 +284,12 @@ def test_noise_has_the_statistics_of_the_product(waveforms, survey, path):
     assert not noise_of(shots_in_survey_order(path), 240.0).any()
 
 
+def test_an_origin_does_not_place_a_survey_of_map_coordinates(waveforms, survey, path):
+    mapped = dataclasses.replace(survey, crs="EPSG:32633")
+    with pytest.raises(ValueError, match=r"origin = .* with survey.crs = 'EPSG:32633'; admissible is either"):
+        write_gedi_l1b(path, waveforms, mapped, **GEOGRAPHIC_PLACE)
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [

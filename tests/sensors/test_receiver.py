@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import jaxlidar as jl
 from jaxlidar._constants import PLANCK_TIMES_LIGHT
 from jaxlidar.sensors.receiver import Receiver, first_return_window, record
 from tests.helpers import BY_PRECISION
@@ -133,6 +134,20 @@ def test_photon_noise_can_be_left_out_and_electronic_noise_is_normal(precision):
     assert np.abs(z.mean(0)).max() * np.sqrt(4000) < Z_LIMIT
     assert np.abs(z.var(0) - 1).max() * np.sqrt(4000 / 2) < Z_LIMIT
     assert np.abs(np.mean(z**4) - 3) * np.sqrt(8 * 4000 / 96) < Z_LIMIT
+
+
+@pytest.mark.parametrize("receiver", [Receiver(background=1e-13), Receiver(electronic_noise=1e-14)])
+def test_the_receiver_of_a_survey_is_not_left_out(receiver):
+    """Planted: the noise of a receiver with its defaults, hundreds of times smaller."""
+    lidar = jl.Lidar(altitude=300.0, receiver=receiver)
+    survey = jl.Survey(lidar, [(0.0, 0.0), (1.0, 0.0)])
+    many = jl.simulate_many(survey, jl.Scene(ground=jl.Ground()), key=jax.random.key(0))
+    with pytest.raises(
+        ValueError, match=r"receiver = None, but the waveform was recorded by .*lidar.receiver"
+    ):
+        record(many, key=jax.random.key(1))
+    record(many, receiver=lidar.receiver, key=jax.random.key(1))
+    record(many, receiver=Receiver(), key=jax.random.key(1))
 
 
 def test_energies_below_the_detection_threshold_are_recorded_as_zero(precision):

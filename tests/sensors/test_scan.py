@@ -36,6 +36,14 @@ def test_a_panorama_has_the_shots_that_are_laid_by_hand():
     assert pattern.direction(pattern.time[:3]).shape == (3, 3)
 
 
+def test_level_beams_have_no_scan_angle_by_rounding():
+    """Along the y axis, ahead and behind: components of 1e-16 have an angle of their own."""
+    pattern = jl.Panorama(zenith=(90.0, 91.0), azimuth=(0.0, 360.0), step=(1.0, 90.0))
+    survey = jl.Survey.scan(jl.Lidar(sensor=(0.0, 0.0, 0.0)), pattern)
+    level = survey.scan_angle[np.isclose(survey.zenith, 90.0)]
+    np.testing.assert_allclose(level, [0.0, 90.0, 0.0, -90.0], atol=1e-9)
+
+
 def test_a_full_turn_has_no_line_twice():
     whole, half = (jl.Panorama((30, 150), (0, end), step=10.0) for end in (360.0, 180.0))
     assert whole.shape == (36, 13)

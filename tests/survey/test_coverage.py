@@ -167,6 +167,24 @@ def test_shots_off_the_scene_are_empty_and_the_others_as_without_them():
     assert np.isin(returns.shot, np.flatnonzero(hits)).all()
 
 
+def test_shots_off_the_scene_say_so_and_are_off_the_map():
+    """Planted: the fractions of light off the map of the shots that were traced alone, zero for others."""
+    voxels = jl.VoxelMap.from_lad(np.full((4, 4, 2), 0.3), voxel_size=10.0)
+    canopy = jl.Canopy(voxels, leaf=jl.LeafOptics(0.45, 0.4))
+    heights = np.zeros((5, 5))
+    heights[2, 2] = 1.0
+    terrain = jl.Terrain(heights, spacing=10.0)
+    survey = jl.Survey.track(jl.Lidar(), (-10.0, 20.0), (50.0, 20.0), 10.0)
+    with pytest.warns(jl.OffMapWarning, match="4 of 7 footprints lie partly outside the voxel map"):
+        many = jl.simulate_many(survey, jl.Scene(canopy=canopy, ground=terrain), beyond="miss", **OPTIONS)
+    np.testing.assert_allclose(many.off_map, [1.0, 0.5, 0.0, 0.0, 0.0, 0.5, 1.0], atol=0.02)
+    missed = int(np.isnan(many.ground_height).sum())
+    assert missed == many.info["missed"] >= 2
+    assert f"{missed} miss the scene, and are empty" in str(many)
+    assert many[0].info["stopped"] == "misses the scene"
+    assert many[3].info["stopped"] != "misses the scene"
+
+
 @pytest.mark.slow
 def test_stores_keep_shots_off_the_scene(tmp_path):
     """Also where a run goes on after a chunk was damaged, and where `rerun` repeats it; and their truth."""

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import jaxlidar as jl
+from jaxlidar.io import FileWarning
 from jaxlidar.survey.acquisition import PULSE_OVERSAMPLING, sampled_pulse
 from jaxlidar.survey.returns import _find_echoes, _median_beside_echoes, position_along_beam
 
@@ -324,6 +325,16 @@ def test_the_strongest_returns_are_taken_where_there_are_too_many(waveforms):
     np.testing.assert_allclose(returns.amplitude, strongest.amplitude.reshape(-1, 2).max(axis=1))
 
 
+def test_files_say_how_many_returns_they_have_no_room_for(tmp_path, monkeypatch, waveforms):
+    monkeypatch.setattr("jaxlidar.survey.waveforms.MAX_LAS_RETURNS", 1)
+    count = len(waveforms)
+    with pytest.warns(FileWarning, match=f"{count} of {2 * count} returns are not written.* {count} shots"):
+        written = waveforms.to_las(tmp_path / "one.las")
+    assert set(written.n_returns.tolist()) == {1}
+    # Asked for, they are no surprise.
+    assert len(waveforms.to_las(tmp_path / "asked.las", max_returns=1)) == count
+
+
 @pytest.mark.slow
 def test_decomposition_agrees_with_the_scene(survey, waveforms):
     """Of one shot."""
@@ -389,6 +400,13 @@ def test_positions_follow_from_the_two_way_time():
 def test_wrong_arguments_are_refused(waveforms, arguments, message):
     with pytest.raises(ValueError, match=message):
         waveforms.returns(**arguments)
+
+
+def test_a_sample_that_is_not_known_does_not_take_its_shot_along(waveforms):
+    record = np.array(waveforms.recorded)
+    record[1, 0, 2] = np.nan
+    with pytest.raises(ValueError, match="record = nan is outside the admissible range"):
+        waveforms.returns(record=record)
 
 
 def test_a_function_measures_the_record_as_peaks_do(waveforms):
