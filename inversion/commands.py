@@ -7,7 +7,6 @@
 import contextlib
 import math
 import multiprocessing
-import shutil
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -38,6 +37,7 @@ from jaxlidar.cli.shared import (
 )
 from jaxlidar.formats.tables import TABLE_FORMATS
 from jaxlidar.results.store import remove_store, store_beside
+from jaxlidar.survey.cloud_tiles import check_tile_folder, remove_tiles, stored_tiles
 
 # Endings of files of points, and the most footprints outside of them that are named.
 _CLOUD_SUFFIXES, _NAMED = (".las", ".laz"), 10
@@ -250,6 +250,22 @@ def _lidar_of_name(ctx: Any, parameter: Any, name: str) -> jl.Lidar:
         raise click.BadParameter(str(error)) from None
 
 
+def _check_default_table(path: Path) -> None:
+    """Refuse to write over a file that the user has not named, unless it is a table of this command."""
+    if not path.exists():
+        return
+    header = b""
+    if path.is_file():
+        with path.open("rb") as file:
+            header = file.readline()
+    if not (header.startswith(b"shot_number,beam,x,y,") and b",covered,true ground," in header):
+        raise click.BadParameter(
+            f"{path} is there already and no table of footprints; nothing is overwritten: name the table to "
+            "write",
+            param_hint="--table",
+        )
+
+
 @contextlib.contextmanager
 def _executor(workers: str | None) -> Iterator[Executor | None]:
     """Give processes of this machine by their number, or the workers of a Dask scheduler by its address."""
@@ -339,19 +355,26 @@ def footprints(
     the threshold: at 0 dB nine of ten grounds are found, and one false one in 20 records of 30 m.
 
     Clouds are simulated tile by tile. If it is interrupted, the same command continues with the tiles that
-    have ended.
+    have ended, in the folder OUT.tiles. Neither a folder of that name with other files is touched, nor a file
+    with the name of the default table that is no such table: both are refused.
 
     \b
     Example:
       jaxlidar footprints tiles/*.laz shots.csv -o l1b.h5 --instrument GEDI --link-margin 3
     """
     clouds, places = inputs
-    table_path = table_path or out.with_suffix(".csv")
     if out.suffix.lower() not in (".h5", ".hdf5"):
         raise click.BadParameter(f"{str(out)!r} does not end in .h5", param_hint="--out")
+    is_default_table = table_path is None
+    table_path = table_path or out.with_suffix(".csv")
     if places.resolve() in (out.resolve(), table_path.resolve()):
         raise click.BadParameter(f"{places} would be overwritten", param_hint="--out")
+    if is_default_table:
+        _check_default_table(table_path)
     folder = out.with_name(out.name + ".tiles")
+    check_tile_folder(folder)
+    # An empty folder may be the user's: it stays.
+    is_of_user = folder.is_dir() and not any(folder.iterdir())
     try:
         with _executor(workers) as executor:
             table = simulate_footprints(
@@ -368,13 +391,20 @@ def footprints(
                 executor=executor,
                 progress=_progress_lines(quiet),
             )
+        table.save(table_path)
+        # All that they held is in the file and the table.
+        remove_tiles(folder)
     except KeyboardInterrupt:
         message = f"finished tiles are kept in {folder}: the same command continues with them"
-        click.echo(f"jaxlidar: interrupted; {message}", err=True)
+        click.echo(
+            f"jaxlidar: interrupted; {message if stored_tiles(folder) else 'no tile was finished'}", err=True
+        )
         return INTERRUPTED
-    table.save(table_path)
-    # All that it held is in the file and the table.
-    shutil.rmtree(folder, ignore_errors=True)
+    finally:
+        # A folder that is not empty stays, with tiles to go on with or what somebody has put there.
+        if not is_of_user:
+            with contextlib.suppress(OSError):
+                folder.rmdir()
     click.echo(f"{len(table)} footprints: {_qualities(table)}; written: {out}, {table_path}")
     (outside,) = np.nonzero(np.isnan(table["covered"]))
     if outside.size:

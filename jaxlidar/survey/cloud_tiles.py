@@ -19,6 +19,7 @@ one number in all tiles, so that all share compiled programs.
 import dataclasses
 import functools
 import os
+import shutil
 import time
 import warnings
 from collections import Counter
@@ -61,6 +62,8 @@ _LARGEST_GAP = 5.0
 REFLECTANCE, _LEAF = 0.3, (0.45, 0.45)
 # Canopies have a multiple of this number of layers, so that few sizes are compiled.
 _LAYERS = 16
+# Name of the file of a tile, with a digest of all that it depends on, and that of a draft of one.
+_TILE_NAME, _DRAFT_NAME = "tile_{}.nc", ".tile_*.part"
 # Arrays of waveforms that are kept.
 _KEPT = ("recorded", "components")
 
@@ -184,15 +187,16 @@ def simulate_tiles(
         raise ValueError(f"files has {path} {times} times; admissible is each file once")
     common_system({"survey": survey.crs} | {str(cloud.path): cloud.crs for cloud in clouds})
     folder = Path(folder)
-    folder.mkdir(parents=True, exist_ok=True)
     tiles = _tiles(clouds, survey, float(tile), edges)
+    # After all that is refused, which leaves no folder behind.
+    folder.mkdir(parents=True, exist_ok=True)
     tasks, paths = [], []
     for number, cloud_tile in enumerate(tiles):
         part, tile_key = survey.subset(cloud_tile.shots), jax.random.fold_in(key, number)
         arguments = (cloud_tile, part, edges, float(rtol))
         # All that the waveforms depend on is part of the name, so that files are never mixed up.
         digest = digest_of(fingerprint({"tile": arguments, "key": portable_key(tile_key)}))
-        paths.append(folder / f"tile_{digest[:32]}.nc")
+        paths.append(folder / _TILE_NAME.format(digest[:32]))
         tasks.append(task(number, simulate_tile, (*arguments, paths[-1]), tile_key))
     missing = [unit for unit in tasks if not paths[unit.number].is_file()]
     shots = sum(len(cloud_tile.shots) for cloud_tile in tiles)
@@ -209,6 +213,32 @@ def simulate_tiles(
         error.add_note(f"finished tiles are kept in {folder}: the same call continues with them")
         raise
     return [(cloud_tile.shots, Waveforms.open(path)) for cloud_tile, path in zip(tiles, paths)]
+
+
+def check_tile_folder(folder: Path) -> None:
+    """Refuse a folder that has anything but tiles. **Raises:** ValueError; NotADirectoryError for a file."""
+    if not folder.exists():
+        return
+    tiles = {*stored_tiles(folder), *folder.glob(_DRAFT_NAME)}
+    others = sorted(path.name for path in folder.iterdir() if path not in tiles)
+    if others:
+        raise ValueError(
+            f"{folder} has {others[0]!r}, which is no tile; admissible is a folder of tiles alone, or none: "
+            "nothing is overwritten. Move it, or give another name to the output"
+        )
+
+
+def remove_tiles(folder: Path) -> None:
+    """Remove the files of tiles, and nothing else, from a folder."""
+    for path in stored_tiles(folder):
+        path.unlink(missing_ok=True)
+    for path in folder.glob(_DRAFT_NAME):
+        shutil.rmtree(path, ignore_errors=True)
+
+
+def stored_tiles(folder: Path) -> list[Path]:
+    """Return the files of tiles in a folder."""
+    return list(folder.glob(_TILE_NAME.format("[0-9a-f]" * 32)))
 
 
 def _in_turn(units: Sequence[WorkUnit]) -> Iterator[WorkUnit]:

@@ -155,6 +155,8 @@ def test_footprints_become_a_file_and_a_table(tmp_path, cloud, capsys, monkeypat
     # The tiles of the interrupted run were used, and are not needed any more.
     assert calls[0] == calls[1]
     assert not (tmp_path / "l1b.h5.tiles").exists()
+    # The same command may write its own table again.
+    commands._check_default_table(tmp_path / "l1b.csv")
     output = capsys.readouterr().out
     assert "3 footprints: 2 bad, 1 good" in output
     assert "outside of all files of points: 1 footprints, 12" in output
@@ -229,6 +231,49 @@ def test_wrong_usage_is_refused(tmp_path, cloud, arguments, message, monkeypatch
     names = {"cloud": str(cloud), "places": "places.csv"}
     with pytest.raises(click.UsageError, match=message):
         commands.footprints.main([names.get(a, a) for a in arguments], standalone_mode=False)
+
+
+def test_a_folder_and_a_table_that_are_not_the_commands_own_stay(tmp_path, cloud, monkeypatch):
+    click = pytest.importorskip("click")
+    folder = tmp_path / "l1b.h5.tiles"
+    folder.mkdir()
+    (folder / "notes.txt").write_text("mine")
+    with pytest.raises(ValueError, match=r"l1b.h5.tiles has 'notes.txt', which is no tile; admissible"):
+        run(tmp_path, cloud)
+    assert [path.name for path in folder.iterdir()] == ["notes.txt"]
+    (folder / "notes.txt").unlink()
+    (tmp_path / "l1b.csv").write_text("x,y\n1,2\n")
+    with pytest.raises(click.BadParameter, match=r"l1b.csv is there already and no table of footprints"):
+        run(tmp_path, cloud)
+    assert (tmp_path / "l1b.csv").read_text() == "x,y\n1,2\n"
+    (tmp_path / "l1b.csv").unlink()
+    # An empty folder of the user stays, with files that appear in it; the command's own tiles go.
+    tile = folder / f"tile_{'0a' * 16}.nc"
+
+    def simulated(*arguments, **options):
+        for path in (tile, folder / "notes.txt"):
+            path.touch()
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(commands, "simulate_footprints", simulated)
+    assert run(tmp_path, cloud)[0] == INTERRUPTED
+    commands.remove_tiles(folder)
+    assert [path.name for path in folder.iterdir()] == ["notes.txt"]
+
+
+def test_a_run_that_is_refused_leaves_no_folder(tmp_path, cloud, capsys, monkeypatch):
+    with pytest.raises(ValueError, match="no shot lies within"):
+        run(tmp_path, cloud, places="x,y\n1,2\n")
+    assert not (tmp_path / "l1b.h5.tiles").exists()
+
+    def interrupted(clouds, places, out, folder, **options):
+        folder.mkdir()
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(commands, "simulate_footprints", interrupted)
+    assert run(tmp_path, cloud)[0] == INTERRUPTED
+    assert "no tile was finished" in capsys.readouterr().err
+    assert not (tmp_path / "l1b.h5.tiles").exists()
 
 
 def test_files_without_a_system_and_footprints_off_all_of_them_are_refused(tmp_path, cloud):
