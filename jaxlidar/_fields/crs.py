@@ -287,6 +287,9 @@ def transform(
         warnings.simplefilter("ignore")
         transformer = pyproj.Transformer.from_crs(source, target, always_xy=True)
     result = np.stack(transformer.transform(*coordinates), axis=-1)
+    # PROJ chooses the operation by the coordinates.
+    if len(result) == 0:
+        return result
     operation = transformer.get_last_used_operation()
     # Conversions are exact, and PROJ states no accuracy, -1, as of transformations where it is not known.
     steps = [step for step in operation.operations or () if step.type_name != "Conversion"]

@@ -176,6 +176,9 @@ def test_points_inventories_and_trajectories_move_to_another_map():
     moved = jl.io.to_crs(cloud, 25833)
     assert moved.crs == "EPSG:25833"
     np.testing.assert_allclose(moved.position, expected.T, atol=1e-6)
+    none = cloud._replace(position=np.zeros((0, 3)), classification=one[:0], intensity=1.0 * one[:0])
+    moved = jl.io.to_crs(none._replace(return_number=one[:0], number_of_returns=one[:0]), 25833)
+    assert (moved.position.shape, moved.crs) == ((0, 3), "EPSG:25833")
     trees = Inventory(position[:, 0], position[:, 1], np.full(3, 7.0), crs=CRS)
     moved = jl.io.to_crs(trees, "EPSG:25833")
     np.testing.assert_allclose([moved.x, moved.y], expected[:2], atol=1e-6)
