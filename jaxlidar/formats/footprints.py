@@ -8,8 +8,9 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int, Shaped
 
+from jaxlidar._fields.checks import warn_user
 from jaxlidar._fields.crs import transform
-from jaxlidar.formats.checks import MAX_COORDINATE
+from jaxlidar.formats.checks import MAX_COORDINATE, FileWarning
 from jaxlidar.formats.coordinates import GEOGRAPHIC
 from jaxlidar.formats.gedi import BEAMS
 from jaxlidar.formats.hdf5 import open_hdf5
@@ -17,15 +18,16 @@ from jaxlidar.formats.text import parse_number, read_lines, split_cells
 
 # Beam of footprints whose file names none.
 _BEAM = "BEAM0101"
-# Names of columns of places, without case.
+# Names of columns of places, without case. That of shot numbers may be "id" where no other one is.
 _COLUMNS = {
     "x": ("x", "easting", "east"),
     "y": ("y", "northing", "north"),
     "longitude": ("longitude", "lon", "lng"),
     "latitude": ("latitude", "lat"),
-    "shot_number": ("shot_number", "shot", "id"),
+    "shot_number": ("shot_number", "shot"),
     "beam": ("beam",),
 }
+_OTHER_NUMBER = "id"
 # Longitude and latitude of shots in levels 1B and 2A: the first pair that a beam has is read.
 _PLACES_OF_PRODUCTS = (
     ("lon_lowestmode", "lat_lowestmode"),
@@ -33,8 +35,9 @@ _PLACES_OF_PRODUCTS = (
     ("geolocation/longitude_lastbin", "geolocation/latitude_lastbin"),
     ("geolocation/longitude_bin0", "geolocation/latitude_bin0"),
 )
-# Digits of a shot number that fit into 64 bits.
-_MAX_DIGITS = 19
+_PRODUCT = "GEDI L1B or L2A"
+# Largest shot number: GeoPackage tables hold signed numbers of 64 bits.
+_MAX_SHOT_NUMBER = 2**63 - 1
 
 
 class Places(NamedTuple):
@@ -52,34 +55,29 @@ def read_places(path: str | os.PathLike[str], crs: str) -> Places:
 
     - `path`: a file whose name ends in ".h5", or a text file of comma-, semicolon- or tab-separated values,
       whose first line names its columns: x and y (easting and northing) in m in `crs`, or longitude and
-      latitude (lon, lat) in degrees on WGS-84; and where they are known shot_number (shot, id), unique whole
-      numbers, and beam, such as "BEAM0101", in any order and case. Other columns are not read.
+      latitude (lon, lat) in degrees on WGS-84; and where they are known shot_number (shot; id where neither
+      is), unique whole numbers up to 2^63 - 1, and beam, such as "BEAM0101", in any order and case. Other
+      columns are not read.
     - `crs`: coordinate reference system of x and y, in metres.
 
     **Returns:** a `Places`. Without shot numbers, rows are numbered from 1; without beams, all are of
-    "BEAM0101".
+    "BEAM0101". Shots of products that have no place are skipped.
 
-    **Raises:** FileNotFoundError where there is no such file. ValueError, naming the file and the line, for
-    columns that are missing, rows of another length, cells that are no numbers, numbers of shots that are not
-    unique, and names that are no beam's; for an HDF5 file that is neither product.
+    **Warns:** `FileWarning` for every beam of a product with shots that have no place, naming the first and
+    their number.
+
+    **Raises:** FileNotFoundError where there is no such file. ValueError, naming the file and the line or the
+    dataset, for columns that are missing or ambiguous, rows of another length, cells that are no numbers,
+    numbers of shots that are not unique, and names that are no beam's; for an HDF5 file that is neither
+    product; for a file without a footprint.
     """
     if Path(path).suffix.lower() in (".h5", ".hdf5"):
         return _places_of_product(Path(path), crs)
     path, lines = read_lines(path)
     delimiter = max(",;\t", key=lines[0].count) if lines else ","
-    names = [name.strip().lower() for name in split_cells(path, 1, lines[0], delimiter)] if lines else []
-    columns = {
-        quantity: min(names.index(name) for name in known if name in names)
-        for quantity, known in _COLUMNS.items()
-        if set(known) & set(names)
-    }
+    names = [name.strip() for name in split_cells(path, 1, lines[0], delimiter)] if lines else []
+    columns = _columns(path, names)
     axes = ("x", "y") if "x" in columns else ("longitude", "latitude")
-    for axis in axes:
-        if axis not in columns:
-            raise ValueError(
-                f"{path}: line 1: no column {axis}; admissible are x and y in m, or longitude and latitude "
-                f"in degrees; there are {', '.join(names) or 'none'}"
-            )
     numbers = [number for number, text in enumerate(lines[1:], 2) if text.strip()]
     if not numbers:
         raise ValueError(f"{path}: line 2: no footprint; admissible is one row or more")
@@ -102,16 +100,7 @@ def read_places(path: str | os.PathLike[str], crs: str) -> Places:
         position = _on_map(path, crs, position, [f"line {number}" for number in numbers])
     shot_numbers = np.arange(1, len(rows) + 1, dtype=np.uint64)
     if "shot_number" in cells:
-        first_line: dict[str, int] = {}
-        for number, cell in zip(numbers, cells["shot_number"]):
-            if not (cell.isascii() and cell.isdigit() and len(cell) <= _MAX_DIGITS):
-                raise ValueError(f"{path}: line {number}: shot_number = {cell!r} is no whole number")
-            if cell in first_line:
-                raise ValueError(
-                    f"{path}: line {number}: shot_number = {cell} is that of line {first_line[cell]}, too"
-                )
-            first_line[cell] = number
-        shot_numbers = np.array([int(cell) for cell in cells["shot_number"]], np.uint64)
+        shot_numbers = _shot_numbers(path, dict(zip(numbers, cells["shot_number"])))
     beams = [cell.upper() for cell in cells.get("beam", [_BEAM] * len(rows))]
     for number, beam in zip(numbers, beams):
         if beam not in BEAMS:
@@ -119,30 +108,103 @@ def read_places(path: str | os.PathLike[str], crs: str) -> Places:
     return Places(position, shot_numbers, np.array(beams))
 
 
+def _columns(path: Path, names: list[str]) -> dict[str, int]:
+    """Return the number of the column of each quantity. **Raises:** as `read_places`."""
+    columns = {}
+    for quantity, known in _COLUMNS.items():
+        matches = [i for i, name in enumerate(names) if name.lower() in known]
+        if quantity == "shot_number" and not matches:
+            matches = [i for i, name in enumerate(names) if name.lower() == _OTHER_NUMBER]
+        if len(matches) > 1:
+            raise ValueError(
+                f"{path}: line 1: {quantity} may be any of the columns "
+                f"{', '.join(repr(names[i]) for i in matches)}; remove or rename all but one"
+            )
+        if matches:
+            columns[quantity] = matches[0]
+    pairs = [[axis for axis in pair if axis in columns] for pair in (("x", "y"), ("longitude", "latitude"))]
+    if all(pairs):
+        of_map, of_earth = (" and ".join(repr(names[columns[axis]]) for axis in pair) for pair in pairs)
+        raise ValueError(
+            f"{path}: line 1: columns {of_map} of a map, and {of_earth} in degrees; remove one pair"
+        )
+    for axis in ("x", "y") if pairs[0] else ("longitude", "latitude"):
+        if axis not in columns:
+            raise ValueError(
+                f"{path}: line 1: no column {axis}; admissible are x and y in m, or longitude and latitude "
+                f"in degrees; there are {', '.join(names) or 'none'}"
+            )
+    return columns
+
+
+def _shot_numbers(path: Path, cells: dict[int, str]) -> Int[np.ndarray, " n"]:
+    """Return the shot numbers of cells, by line. **Raises:** as `read_places`."""
+    first_line: dict[int, int] = {}
+    for line, cell in cells.items():
+        if not (cell.isascii() and cell.isdigit()):
+            raise ValueError(f"{path}: line {line}: shot_number = {cell!r} is no whole number from 0 on")
+        # Python converts no text of thousands of digits.
+        digits = cell.lstrip("0") or "0"
+        if len(digits) > len(str(_MAX_SHOT_NUMBER)) or int(digits) > _MAX_SHOT_NUMBER:
+            raise ValueError(
+                f"{path}: line {line}: shot_number = {digits[:40]} is too large; admissible is "
+                f"[0, {_MAX_SHOT_NUMBER}]"
+            )
+        number = int(digits)
+        if number in first_line:
+            raise ValueError(
+                f"{path}: line {line}: shot_number = {number} is that of line {first_line[number]}, too"
+            )
+        first_line[number] = line
+    return np.array(list(first_line), np.uint64)
+
+
 def _places_of_product(path: Path, crs: str) -> Places:
     """Read the places of shots of levels 1B or 2A. **Raises:** as `read_places`."""
-    product, shot_numbers, beams, places = "GEDI L1B or L2A", [], [], []
+    shot_numbers, beams, places, locations, remarks = [], [], [], [], []
     with open_hdf5(path) as file:
-        for beam in file.groups("BEAM", product):
+        for beam in file.groups("BEAM", _PRODUCT):
             pairs = [pair for pair in _PLACES_OF_PRODUCTS if all(file.has(f"{beam}/{n}") for n in pair)]
             if not pairs:
                 raise ValueError(
-                    f"{file.location(beam)}: no longitude and latitude; it is no {product} product"
+                    f"{file.location(beam)}: no longitude and latitude; it is no {_PRODUCT} product"
                 )
-            place = [
-                file.in_unit(f"{beam}/{n}", file.numbers(f"{beam}/{n}", product), "degrees") for n in pairs[0]
+            axes = [
+                file.in_unit(f"{beam}/{n}", file.numbers(f"{beam}/{n}", _PRODUCT), "degrees")
+                for n in pairs[0]
             ]
-            shot_numbers.append(file.read(f"{beam}/shot_number", product).astype(np.uint64))
-            beams.append(np.full(shot_numbers[-1].size, beam))
-            places.append(np.stack(place, axis=1))
-    numbers, degrees = np.concatenate(shot_numbers), np.concatenate(places)
-    if len(degrees) != numbers.size:
-        raise ValueError(f"{path}: {numbers.size} shot numbers belong to {len(degrees)} places")
-    # Shots without a place have fill values.
-    is_placed = np.isfinite(degrees).all(axis=1) & (np.abs(degrees) <= [180.0, 90.0]).all(axis=1)
-    numbers, beams = numbers[is_placed], np.concatenate(beams)[is_placed]
+            numbers, location = file.read(f"{beam}/shot_number", _PRODUCT), file.location(beam)
+            if not axes[0].size == axes[1].size == numbers.size:
+                raise ValueError(
+                    f"{location}: {numbers.size} shot numbers belong to {axes[0].size} longitudes and "
+                    f"{axes[1].size} latitudes"
+                )
+            degrees = np.stack(axes, axis=1)
+            # Shots without a place have fill values.
+            is_placed = (np.abs(degrees) <= [180.0, 90.0]).all(axis=1)
+            (skipped,) = np.nonzero(~is_placed)
+            if skipped.size:
+                i = skipped[0]
+                remarks.append(
+                    f"{location}/{pairs[0][0]}, shot {numbers[i]}: longitude {degrees[i, 0]:g} and "
+                    f"latitude {degrees[i, 1]:g} are no place: {skipped.size} of {numbers.size} shots of "
+                    f"{beam} skipped"
+                )
+            shot_numbers.append(numbers[is_placed].astype(np.uint64))
+            beams += [beam] * int(is_placed.sum())
+            places.append(degrees[is_placed])
+            locations += [f"{location}/shot_number[{i}]" for i in np.flatnonzero(is_placed)]
+    numbers = np.concatenate(shot_numbers)
+    if numbers.size == 0:
+        raise ValueError(f"{path}: no shot has a place; admissible is a file with one or more")
+    for remark in remarks:
+        warn_user(remark, FileWarning)
+    first_location: dict[int, str] = {}
+    for number, location in zip(numbers.tolist(), locations):
+        if first_location.setdefault(number, location) != location:
+            raise ValueError(f"{location} = {number} is that of {first_location[number]}, too")
     rows = [f"shot {number}" for number in numbers]
-    return Places(_on_map(path, crs, degrees[is_placed], rows), numbers, beams)
+    return Places(_on_map(path, crs, np.concatenate(places), rows), numbers, np.array(beams))
 
 
 def _on_map(path: Path, crs: str, degrees: np.ndarray, rows: Sequence[str]) -> np.ndarray:

@@ -9,7 +9,7 @@ from inversion import commands, footprints
 from inversion.metrics.gedi_simulator import link_margin_noise
 from jaxlidar.cli.constants import INTERRUPTED, SUCCESS
 from jaxlidar.formats.footprints import read_places
-from jaxlidar.io import read_gedi_l1b, write_gedi_l1b, write_las
+from jaxlidar.io import FileWarning, read_gedi_l1b, write_gedi_l1b, write_las
 from tests.fuzz.fuzz_changes import change_text
 
 pytest.importorskip("laspy")
@@ -42,6 +42,9 @@ def test_places_are_read_from_maps_and_from_longitude_and_latitude(tmp_path):
     assert np.diff(places.position[:, 1]) == pytest.approx(111_200.0, abs=100.0)
     assert places.shot_number.tolist() == [1, 2]
     assert set(places.beam) == {"BEAM0101"}
+    # An id is that of something else where the shots have numbers.
+    places = places_of(tmp_path, "id,shot_number,x,y\n1,19640119100108615,2,3\n2,9223372036854775807,2,4\n")
+    assert places.shot_number.tolist() == [19640119100108615, 2**63 - 1]
 
 
 @pytest.mark.parametrize(
@@ -57,6 +60,17 @@ def test_places_are_read_from_maps_and_from_longitude_and_latitude(tmp_path):
         ("lon,lat\n15,50\n-75,0\n", "line 3: longitude -75 and latitude 0 lie outside"),
         ("x,y,id\n1,2,3.5\n", "line 2: shot_number = '3.5' is no whole number"),
         ("x,y,id\n1,2,7\n3,4,7\n", "line 3: shot_number = 7 is that of line 2"),
+        ("x,y,id\n1,2,1\n\n3,4,01\n", "line 4: shot_number = 1 is that of line 2, too"),
+        ("x,y,id\n1,2,-1\n", "line 2: shot_number = '-1' is no whole number from 0 on"),
+        (
+            "x,y,id\n1,2,18446744073709551615\n",
+            "line 2: shot_number = 18446744073709551615 is too large; admissible is .0, 9223372036854775807.",
+        ),
+        ("x,y,x\n1,2,3\n", "line 1: x may be any of the columns 'x', 'x'; remove or rename all but one"),
+        ("Easting,y,x\n1,2,3\n", "line 1: x may be any of the columns 'Easting', 'x'"),
+        ("x,y,shot,shot_number\n1,2,3,4\n", "line 1: shot_number may be any of the columns 'shot', 'shot_n"),
+        ("x,y,Lon,lat\n1,2,15,50\n", "line 1: columns 'x' and 'y' of a map, and 'Lon' and 'lat' in degrees"),
+        ("x,lat\n1,2\n", "line 1: columns 'x' of a map, and 'lat' in degrees; remove one pair"),
         ("x,y,beam\n1,2,BEAM0111\n", "line 2: beam = 'BEAM0111' is none of BEAM0000"),
     ],
 )
@@ -94,9 +108,24 @@ def test_places_are_read_from_products(tmp_path):
     with h5py.File(tmp_path / "l2a.h5", "w") as file:
         file["BEAM0101/shot_number"] = np.array([4, 5], np.uint64)
         file["BEAM0101/lon_lowestmode"], file["BEAM0101/lat_lowestmode"] = [15.0, -9999.0], [50.0, -9999.0]
-    places = read_places(tmp_path / "l2a.h5", CRS)
+    skipped = "l2a.h5: /BEAM0101/lon_lowestmode, shot 5: longitude -9999 .*: 1 of 2 shots of BEAM0101 skipped"
+    with pytest.warns(FileWarning, match=skipped):
+        places = read_places(tmp_path / "l2a.h5", CRS)
     assert places.shot_number.tolist() == [4]
     assert places.position[0, 0] == pytest.approx(5e5, abs=1e-3)
+    for name, numbers, longitude in (("none", [], []), ("unplaced", [4, 5], [np.nan, -9999.0])):
+        with h5py.File(tmp_path / f"{name}.h5", "w") as file:
+            file["BEAM0101/shot_number"] = np.array(numbers, np.uint64)
+            file["BEAM0101/lon_lowestmode"] = file["BEAM0101/lat_lowestmode"] = np.array(longitude, float)
+        with pytest.raises(ValueError, match=f"{name}.h5: no shot has a place; admissible"):
+            read_places(tmp_path / f"{name}.h5", CRS)
+    with h5py.File(tmp_path / "twice.h5", "w") as file:
+        for beam, numbers in (("BEAM0000", [7, 8]), ("BEAM0101", [9, 7])):
+            file[f"{beam}/shot_number"] = np.array(numbers, np.uint64)
+            file[f"{beam}/lon_lowestmode"], file[f"{beam}/lat_lowestmode"] = [15.0, 15.0], [50.0, 50.0]
+    twice = r"twice.h5: /BEAM0101/shot_number\[1\] = 7 is that of .*twice.h5: /BEAM0000/shot_number\[0\], too"
+    with pytest.raises(ValueError, match=twice):
+        read_places(tmp_path / "twice.h5", CRS)
     with h5py.File(tmp_path / "other.h5", "w") as file:
         file["BEAM0101/shot_number"] = np.array([4], np.uint64)
     with pytest.raises(ValueError, match=r"other.h5: /BEAM0101: no longitude"):
