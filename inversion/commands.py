@@ -269,11 +269,16 @@ def _check_default_table(path: Path) -> None:
 @contextlib.contextmanager
 def _executor(workers: str | None) -> Iterator[Executor | None]:
     """Give processes of this machine by their number, or the workers of a Dask scheduler by its address."""
+    refusal = click.BadParameter(
+        f"{workers!r}; admissible are a number of processes, 1 or more, and the address of a Dask scheduler, "
+        "such as tcp://192.168.0.1:8786",
+        param_hint="--workers",
+    )
     if workers is None:
         yield None
-    elif workers.isdigit():
-        if workers == "0":
-            raise click.BadParameter("0 workers; admissible is 1 or more", param_hint="--workers")
+    elif ":" not in workers:
+        if not (workers.isascii() and workers.isdigit() and int(workers) > 0):
+            raise refusal
         with ProcessPoolExecutor(int(workers), multiprocessing.get_context("spawn")) as executor:
             yield executor
     else:
@@ -281,7 +286,12 @@ def _executor(workers: str | None) -> Iterator[Executor | None]:
             from distributed import Client  # pyright: ignore[reportMissingImports]
         except ImportError as error:
             raise ImportError('workers of Dask need distributed: pip install "jaxlidar[cluster]"') from error
-        with Client(workers) as client:
+        try:
+            # Not the default: xarray would leave its own work to a scheduler, also to one that is not there.
+            client = Client(workers, set_as_default=False)
+        except ValueError as error:
+            raise refusal from error
+        with client:
             yield client.get_executor()
 
 

@@ -249,7 +249,12 @@ def test_errors_of_geolocation_leave_the_stated_places(tmp_path, cloud):
         (["cloud", "places", "-o", "o.h5", "--table", "t.txt"], "ends in none of .csv"),
         (["cloud", "places", "-o", "places.h5"], "places.csv would be overwritten"),
         (["cloud", "places", "-o", "o.h5", "--instrument", "GEDY"], "instrument 'GEDY' is not known"),
-        (["cloud", "places", "-o", "o.h5", "--workers", "0"], "0 workers"),
+        (["cloud", "places", "-o", "o.h5", "--workers", "0"], "'0'; admissible are a number of processes"),
+        (
+            ["cloud", "places", "-o", "o.h5", "--workers", "foo"],
+            "'foo'; admissible .* tcp://192.168.0.1:8786",
+        ),
+        (["cloud", "places", "-o", "o.h5", "--workers", "-1"], "'-1'; admissible are a number of processes"),
         (["cloud", "places", "-o", "o.h5", "--link-cover", "1"], "is not in the range"),
     ],
 )
@@ -317,6 +322,17 @@ def test_files_without_a_system_and_footprints_off_all_of_them_are_refused(tmp_p
 def test_a_link_margin_is_a_number(tmp_path, cloud):
     with pytest.raises(ValueError, match="link_margin = nan"):
         run(tmp_path, cloud, "--link-margin", "nan")
+
+
+@pytest.mark.parametrize("address", ["foo:", "tcp://foo", "nonsense://foo:1"])
+def test_addresses_that_are_none_are_refused(tmp_path, cloud, address):
+    click = pytest.importorskip("click")
+    pytest.importorskip("distributed")
+    with pytest.raises(
+        click.BadParameter, match=f"'{address}'; admissible are a number of processes"
+    ) as info:
+        run(tmp_path, cloud, "--workers", address)
+    assert info.value.param_hint == "--workers"
 
 
 def test_a_scheduler_of_dask_needs_dask(tmp_path, cloud, monkeypatch):
