@@ -362,7 +362,9 @@ def footprints(
     or longitude and latitude, and optionally shot_number and beam; or a GEDI level 1B or 2A file (.h5).
 
     A link margin is 10 log10 of what the echo of the ground below the given cover exceeds the noise by, over
-    the threshold: at 0 dB nine of ten grounds are found, and one false one in 20 records of 30 m.
+    the threshold: at 0 dB nine of ten grounds are found, and one false one in 20 records of 30 m. Without it
+    records have no noise and the file states none: what follows from noise (blairSense, sensitivity) has no
+    numbers, and the quality is not judged by noise.
 
     Clouds are simulated tile by tile. If it is interrupted, the same command continues with the tiles that
     have ended, in the folder OUT.tiles. Neither a folder of that name with other files is touched, nor a file

@@ -59,7 +59,9 @@ def simulate_footprints(
     - `out`: the HDF5 file to write.
     - `lidar`: that of all footprints.
     - `link_margin`: dB, at the canopy cover `cover`, in [0, 1): noise as `inversion.metrics.gedi_simulator`
-      states. It is the standard deviation before the product's smoothing. Default None: no noise.
+      states. It is the standard deviation before the product's smoothing. Default None: no noise. The file
+      then states a noise of 0, the columns `blairSense` and `sensitivity` are NaN, and `quality` is not
+      judged by noise.
     - `geolocation_error`: standard deviation in m, along x and y, of the error of the stated places, which
       is the same along a beam. Light falls on the true places. Default 0.
     - `crs`: coordinate reference system of files that declare none, in metres. Default None: the files'.
@@ -110,7 +112,7 @@ def simulate_footprints(
     pulse_std = 0.5 * jl.SPEED_OF_LIGHT * float(lidar.pulse.std)
     # A Gaussian's 1/e^2 radius is twice its standard deviation.
     footprint_std = 0.5 * float(survey.footprint_radius.max())
-    noise: dict[str, Any] = {}
+    noise: dict[str, Any] = {"noise_std": 0.0}
     if link_margin is not None:
         sigma = link_margin_noise(link_margin, cover, pulse_std, footprint_std)
         # Of a record of unit energy per m, in counts of a sample.

@@ -29,7 +29,8 @@ tenth of it |
 
 Here d is the largest departure of the pulse from such cubics, scaled to the peak of the record.
 
-The thresholds hold for any instrument; the checks of a record need several samples within the pulse.
+The thresholds hold for any instrument; the checks of a record need several samples within the pulse. A record
+without noise, s = 0, is neither weak nor of uneven noise.
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -164,14 +165,15 @@ def judge_record(
     **Arguments:**
 
     - `signal`: (bins,) record, background removed.
-    - `noise`: standard deviation of a sample, above 0.
+    - `noise`: standard deviation of a sample, 0 or more; 0 for a simulated record without noise, which is not
+      judged by it.
     - `pulse`: (lags,) the transmitted pulse at the record's sampling. Default None: dead samples are not
       checked, as they cannot be distinguished from narrow echoes.
     - `degrade`, `stale_return`: GEDI's flags, as `jaxlidar.io.GediShot` has them. Default None: unknown.
 
     **Returns:** a `Verdict`.
 
-    **Raises:** ValueError for `noise` that is not above 0, and for samples that are not finite or fewer than
+    **Raises:** ValueError for `noise` below 0, and for samples that are not finite or fewer than
     five.
 
     **Example:** a record that ends within its signal.
@@ -181,7 +183,7 @@ def judge_record(
     >>> inversion.judge_record(echo, noise=1.0)
     Verdict(quality='bad', reasons=('cut off: the signal reaches the last samples',))
     """
-    check_number("noise", noise, 0.0, low_open=True)
+    check_number("noise", noise, 0.0)
     for name, flag in (("degrade", degrade), ("stale_return", stale_return)):
         if flag is not None:
             check_integer(name, flag, 0)
@@ -190,6 +192,8 @@ def judge_record(
         raise ValueError(f"signal has the shape {y.shape}; admissible is (bins,), five or more")
     check_range("signal", y)
     peak, failures = float(y.max()), []
+    if noise == 0 and not peak > 0:
+        failures.append((_BAD, "no signal: no sample is above zero"))
     if peak < _SIGNAL_TO_NOISE[0] * noise:
         quality = _DOUBTFUL if peak >= _SIGNAL_TO_NOISE[1] * noise else _BAD
         failures.append((quality, f"weak: the largest sample is {peak / noise:.1f} times the noise"))
@@ -208,7 +212,7 @@ def judge_record(
         if (dead := int(np.sum(np.abs(_departure_from_cubic(y)) > limit))) > 0:
             failures.append((_DOUBTFUL, f"dead samples: {dead} do not fit their neighbours"))
     lit = np.flatnonzero(y > _CUT_OFF_SIGMAS * noise)
-    if lit.size:
+    if lit.size and noise > 0:
         before, after = y[: lit[0]], y[lit[-1] + 1 :]
         if min(before.size, after.size) >= _QUIET_SAMPLES[0]:
             ratio = np.std(after[-_QUIET_SAMPLES[1] :]) / max(np.std(before[: _QUIET_SAMPLES[1]]), 1e-30)

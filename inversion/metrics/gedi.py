@@ -3,7 +3,8 @@ r"""GEDI's level 2A metrics from its level 1B records, by the rules of the produ
 1. Subtract the mean noise, and smooth the record y by two Gaussians: one for ends and energy, w, and one for
    modes, m.
 2. The signal begins at the highest two samples in a row of w above the front threshold, and ends at the
-   lowest two above the back threshold. Thresholds are in the product's standard deviations of the noise.
+   lowest two above the back threshold. Thresholds are in the product's standard deviations of the noise; for
+   a simulated record without noise, in thousandths of the largest sample.
 3. Modes are maxima of m above the back threshold; the lowest one is taken for the ground.
 4. The relative height RH_q is the height above the lowest mode below which the fraction q / 100 of the energy
    sum w between the two ends lies.
@@ -46,6 +47,8 @@ _RH_FRACTIONS = np.arange(101) / 100
 # Records are smoothed by the receiver as by a Gaussian of this standard deviation, ns or samples; the
 # transmitted pulse is not.
 RECEIVER_SMOOTHING = 1.7
+# Noise by which thresholds count where a record has none, over the largest sample: below it lies rounding.
+NOISE_OF_THRESHOLDS = 1e-3
 # Lags in ns of the pulse about its time zero.
 _LAGS = np.arange(-64.0, 65.0)
 # What is used of a shot.
@@ -142,7 +145,7 @@ def gedi_metrics(shots: Any, settings: GediSettings | None = None) -> GediMetric
     **Arguments:**
 
     - `shots`: a list of shots, those of `jaxlidar.io.read_gedi_l1b` or objects with the same `elevation`,
-      `waveform`, `noise_mean` and `noise_std`.
+      `waveform`, `noise_mean` and `noise_std`; the last is 0 for a simulated record without noise.
     - `settings`: see `gedi_settings`. Default: those of group 1.
 
     **Returns:** a `GediMetrics`.
@@ -208,7 +211,7 @@ def pad_shots(shots: list[Any], *, size: int | None = None, is_checked: bool = F
                 # Over the largest sample, which single precision holds whatever the unit of the record.
                 peak = np.max(np.abs(record)) or 1.0
                 records[row, : n_samples[i]] = record / peak
-                noise[row], count[row] = shot.noise_std / peak, n_samples[i]
+                noise[row], count[row] = shot.noise_std / peak or NOISE_OF_THRESHOLDS, n_samples[i]
                 top[i], bottom = shot.elevation[0], shot.elevation[-1]
                 if not is_checked:
                     even_step("elevation", shot.elevation, decreasing=True)

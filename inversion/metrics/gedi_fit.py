@@ -235,6 +235,8 @@ def _prepare(shot: Any, ground: float, lowest_mode: float) -> list[PreparedShot]
     """Return a shot about each of its possible grounds. **Raises:** ValueError for one that has no fit."""
     if not np.isfinite(ground):
         raise ValueError("no ground above the noise")
+    if not shot.noise_std > 0:
+        raise ValueError(f"noise_std = {shot.noise_std:g}; a fit needs a record with noise")
     # Refuses pulses that no lidar has.
     jl.SampledPulse(time=shot.pulse_time, power=shot.pulse_power)
     return [PreparedShot(shot, elevation) for elevation in start_grounds(ground, lowest_mode)]

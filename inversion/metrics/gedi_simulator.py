@@ -119,7 +119,7 @@ def simulator_table(
       below each ground, E_c the rest, and 1.425 the reflectance of plants over that of the ground.
     - `waveEnergy`: energy in counts m.
     - `blairSense`: cover through which the ground is detected with the probability 0.9, by the record's noise
-      (see the module's docstring): 1 - (n_n + n_s) sigma sqrt(2 pi) s / E.
+      (see the module's docstring): 1 - (n_n + n_s) sigma sqrt(2 pi) s / E; NaN for a record without noise.
     - `FHD`: foliage height diversity -sum p ln p of the samples' fractions p of the energy.
     - `niM2`, `niM2.1`: mean of the height above `gHeight` to the power of 2, or 2.1, weighted by the energy;
       negative below the ground.
@@ -211,7 +211,7 @@ def _row(shot: GediShot, footprint_std: float) -> dict[str, Float[np.ndarray, ".
         **{name: levels - z for name, z in zip(_RELATIVE_HEIGHTS, grounds.values())},
         **dict(zip(("gaussHalfCov", "maxHalfCov", "infHalfCov"), covers.values())),
         "waveEnergy": total,
-        "blairSense": 1.0 - weakest / total,
+        "blairSense": 1.0 - weakest / total if sigma > 0 else np.nan,
         "FHD": float(-np.sum(fractions * np.log(fractions))),
         **{
             name: float(np.average(np.sign(above) * np.abs(above) ** power, weights=record))

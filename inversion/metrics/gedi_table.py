@@ -22,6 +22,9 @@ the shape of its echo, and of the noise of the energies (`_plants`).
 **Sensitivity.** The largest cover under which the ground is detected: one less the energy of the weakest echo
 of the pulse that rises above the threshold of modes, over the energy of the record (Hancock et al. 2019).
 
+**Records without noise.** Simulated shots may have the noise 0, and no sample below their mean noise. They
+have no sensitivity, and their quality is not judged by noise. Their thresholds are as in `gedi.py`.
+
 Records are padded to one length and computed in batches of one size, so that any number of shots, of any
 lengths, compiles each program once.
 """
@@ -38,6 +41,7 @@ from jaxtyping import ArrayLike, Float
 from inversion.fit.quality import Verdict
 from inversion.metrics.cover import ground_and_canopy, plant_area_profile
 from inversion.metrics.gedi import (
+    NOISE_OF_THRESHOLDS,
     RECEIVER_SMOOTHING,
     gedi_settings,
     judge_shot,
@@ -70,6 +74,8 @@ from jaxlidar.survey.records import record_bucket
 _GROUPS, _BATCH = range(1, 7), 64
 # Groups whose threshold of modes noise hardly exceeds: 4 standard deviations or more.
 _STRICT_GROUPS = (1, 3, 4, 6)
+# Rounding of a sample that is stored in single precision, as a fraction.
+_ROUNDING = 2.0 * np.finfo(np.float32).eps
 # Fewest samples of a record.
 _MIN_SAMPLES = 5
 # Sum of the noise's autocorrelation, 2 sqrt(pi) r with the receiver's smoothing r.
@@ -132,7 +138,8 @@ def gedi_table(
     **Returns:** a `jaxlidar.io.ShotTable`, a row for each shot in their order, with
 
     - `shot_number`, `beam`, `latitude`, `longitude` (of the last bin), `delta_time`, `solar_elevation`,
-      `degrade`, `stale_return`, NaN where the file does not have them, and `sensitivity`;
+      `degrade`, `stale_return`, NaN where the file does not have them, and `sensitivity`, NaN for a simulated
+      record without noise (`noise_std` is 0);
     - `ground`, `ground_stderr`: elevation of the matched mode;
     - `elev_lowestmode`, `elev_highestreturn`, `num_detectedmodes`, `rh` (shots, 101), `rh_stderr` of setting
       group `group`, and `elev_lowestmode_a1` ... `rh_a6` of all groups, by the rules of level 2A;
@@ -216,7 +223,7 @@ def gedi_table(
         if callable(progress):
             seconds = time.perf_counter() - start_time
             progress(Progress(int(first + batch.size), int(usable.size), seconds))
-    verdicts = [_verdict_after(verdict, estimates, i) for i, verdict in enumerate(verdicts)]
+    verdicts = [_verdict_after(rows[i], verdict, estimates, i) for i, verdict in enumerate(verdicts)]
     table = _table(rows, estimates, verdicts, group, structure)
     if not fit:
         return table
@@ -251,10 +258,16 @@ def _refusal(shot: Any) -> str | None:
     if isinstance(shot, IncompleteShot):
         return str(shot.error)
     try:
-        record_above_noise(shot)
+        record = record_above_noise(shot)
         check_integer("number of samples", shot.waveform.size, _MIN_SAMPLES)
         even_step("elevation", shot.elevation, decreasing=True)
-        check_number("noise_std", shot.noise_std, 0.0, low_open=True)
+        check_number("noise_std", shot.noise_std, 0.0)
+        rounding = _ROUNDING * np.max(np.abs(shot.waveform))
+        if shot.noise_std == 0 and record.min() < -rounding:
+            raise ValueError(
+                f"noise_std = 0, but a sample is {-record.min():.3g} below noise_mean; admissible is 0 for a "
+                "record without noise"
+            )
         power = pulse_samples(shot)
         check_range("pulse_power", power)
         check_number("largest pulse_power", power.max(), 0.0, low_open=True)
@@ -269,15 +282,15 @@ def _verdict_before(row: Any, refusal: str | None) -> Verdict:
     return judge_shot(row) if refusal is None else Verdict("bad", (refusal,))
 
 
-def _verdict_after(verdict: Verdict, estimates: dict[str, np.ndarray], i: int) -> Verdict:
+def _verdict_after(row: Any, verdict: Verdict, estimates: dict[str, np.ndarray], i: int) -> Verdict:
     """Return the worse of the verdict on a record and that on its estimates."""
     if verdict.quality == "bad" and not np.isfinite(estimates["elev_highestreturn"][i]):
         return verdict
     if not np.isfinite(estimates["ground"][i]):
         return verdict & Verdict("bad", ("no ground above the noise",))
     sensitivity = float(estimates["sensitivity"][i])
-    # Written so that NaN fails.
-    if not sensitivity >= _LEAST_SENSITIVITY:
+    # Written so that NaN fails; records without noise have no sensitivity.
+    if row.noise_std > 0 and not sensitivity >= _LEAST_SENSITIVITY:
         reason = f"sensitivity {sensitivity:.2f}: dense canopies hide the ground"
         verdict &= Verdict("doubtful", (reason,))
     lowest_modes = [estimates[f"elev_lowestmode_a{n}"][i] for n in _STRICT_GROUPS]
@@ -329,6 +342,8 @@ def _estimate(
     # Heights over the first sample: elevations lose 0.1 mm to 1 mm in single precision.
     height = -step[:, None] * np.arange(padded_size)
     noise_std = np.array([float(shot.noise_std) for shot in filled])
+    least_noise = NOISE_OF_THRESHOLDS * np.max(np.abs(records), axis=1)
+    threshold_noise = np.where(noise_std > 0, noise_std, least_noise)
     pulse = np.stack([pulse_samples(shot) for shot in filled])
 
     padded = pad_shots(filled, size=padded_size, is_checked=True)
@@ -346,13 +361,13 @@ def _estimate(
                 estimates[name] = np.asarray(getattr(metrics, name), float)
 
     record_noise = _quiet_noise(records, n_samples, step, top - estimates["elev_highestreturn"], noise_std)
-    ground = np.asarray(find_ground(height, records, pulse=pulse, noise=noise_std), float)
+    ground = np.asarray(find_ground(height, records, pulse=pulse, noise=threshold_noise), float)
     ground_stderr = _ground_stderr(records, step, ground, pulse, record_noise)
     estimates["ground"], estimates["ground_stderr"] = top + ground, ground_stderr
     estimates["sensitivity"] = _sensitivity(records, pulse, noise_std)
     estimates["rh_stderr"] = _rh_stderr(estimates, records, step, record_noise, ground_stderr)
     zenith = np.array([shot.zenith for shot in filled])
-    batch = _BatchRecords(height, records, step, pulse, noise_std, record_noise, zenith)
+    batch = _BatchRecords(height, records, step, pulse, threshold_noise, record_noise, zenith)
     estimates |= _plants(batch, ground, structure, estimates)
     return {name: values[:count] for name, values in estimates.items()}
 
@@ -412,7 +427,8 @@ def _sensitivity(records: np.ndarray, pulse: np.ndarray, noise_std: np.ndarray) 
     width = np.sqrt(_smoothing_width(pulse) ** 2 + _pulse_variance(pulse))
     weakest = gedi_settings(1).back_threshold * noise_std * np.sqrt(2.0 * np.pi) * width
     total = records.sum(axis=1)
-    return np.where(total > 0, 1.0 - weakest / np.where(total > 0, total, 1.0), np.nan)
+    is_known = (total > 0) & (noise_std > 0)
+    return np.where(is_known, 1.0 - weakest / np.where(total > 0, total, 1.0), np.nan)
 
 
 def _rh_stderr(
@@ -440,7 +456,8 @@ class _BatchRecords(NamedTuple):
     """Records of a batch of shots, padded: (shots, samples), and what belongs to each, (shots,).
 
     - `height`: m over the first sample. `records`: counts less the mean noise. `step`: m.
-    - `pulse`: (shots, lags). `noise_std`: the product's. `record_noise`: of the smoothed samples.
+    - `pulse`: (shots, lags). `threshold_noise`: the product's, by which thresholds count. `record_noise`: of
+      the smoothed samples.
     - `zenith`: of the beam in degrees.
     """
 
@@ -448,7 +465,7 @@ class _BatchRecords(NamedTuple):
     records: np.ndarray
     step: np.ndarray
     pulse: np.ndarray
-    noise_std: np.ndarray
+    threshold_noise: np.ndarray
     record_noise: np.ndarray
     zenith: np.ndarray
 
@@ -472,7 +489,7 @@ def _plants(
     """
     height, records, pulse, step = batch.height, batch.records, batch.pulse, batch.step
     ratio = structure.reflectance_ratio
-    ends = signal_ends(height, records, noise=batch.noise_std, pulse=pulse)
+    ends = signal_ends(height, records, noise=batch.threshold_noise, pulse=pulse)
     # NaN, of shots without ground, passes through: a missing ground gives a missing split.
     options: dict[str, Any] = {"pulse": pulse, "ground": ground, "ends": ends, "reflectance_ratio": ratio}
     split = ground_and_canopy(height, records, **options)

@@ -235,8 +235,11 @@ def test_errors_of_geolocation_leave_the_stated_places(tmp_path, cloud):
     assert float(table["true ground"][0]) == pytest.approx(105.5 + 0.1 * shift[0, 0], abs=0.2)
     stated = read_places(tmp_path / "l1b.h5", CRS).position
     np.testing.assert_allclose(stated, [[EAST + 55, NORTH + 60], [EAST + 55, NORTH + 65]], atol=0.02)
-    # Without noise the record is quiet.
-    assert shots[0].signal[:100].std() == 0.0
+    # Without noise the record is quiet, states no noise, and nothing is judged by it or made up from it.
+    assert shots[0].signal[:100].std() == shots[0].noise_std == 0.0
+    assert table["quality"] == ["good"] * 2, table["reasons"]
+    assert table["blairSense"] == table["sensitivity"] == [""] * 2
+    assert all(len(table[name][0]) > 0 for name in ("gHeight", "cover", "ground", "cover_jaxlidar", "rh_98"))
 
 
 @pytest.mark.parametrize(

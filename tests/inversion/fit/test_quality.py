@@ -65,6 +65,17 @@ def test_damaged_records_are_not_good(quality, reason, change):
     assert any(r.startswith(reason) for r in verdict.reasons)
 
 
+def test_records_without_noise_are_not_judged_by_it():
+    echo = 100.0 * np.exp(-0.5 * ((BIN - 380.0) / 6.5) ** 2)
+    assert judge_record(echo, noise=0.0, pulse=PULSE) == Verdict("good", ())
+    for change, reason in (
+        (0.0 * echo, "no signal"),
+        (echo[:386], "cut off"),
+        (np.minimum(echo, 9), "clipped"),
+    ):
+        assert judge_record(change, noise=0.0, pulse=PULSE).reasons[0].startswith(reason)
+
+
 def test_flags_count():
     signal = record(np.random.default_rng(3))
     assert verdict_on(signal, degrade=70).quality == "doubtful"

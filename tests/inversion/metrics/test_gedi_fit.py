@@ -81,7 +81,7 @@ def test_pulses_of_any_length_become_those_of_one_length():
 
 def unusable_shots():
     """Return shots that are refused before anything is compiled."""
-    return [shot(1, noise_std=0.0), shot(2, waveform=np.full(900, np.nan))]
+    return [shot(1, noise_std=-1.0), shot(2, waveform=np.full(900, np.nan))]
 
 
 def test_shots_without_a_fit_have_columns_of_nan_and_the_reason(tmp_path):
@@ -104,12 +104,14 @@ def test_shots_without_a_fit_have_columns_of_nan_and_the_reason(tmp_path):
 
 def test_a_shot_that_cannot_be_prepared_is_bad():
     negative = shot(pulse_power=np.where(np.abs(np.arange(81) - 40) < 20, 1.0, -0.1))
-    fits = gedi_fit.fit_gedi_shots([shot(), negative], np.array([np.nan, 100.0]), np.full(2, np.nan))
-    assert [verdict.quality for verdict in fits.verdicts] == ["bad", "bad"]
+    shots = [shot(), negative, shot(noise_std=0.0)]
+    fits = gedi_fit.fit_gedi_shots(shots, np.array([np.nan, 100.0, 100.0]), np.full(3, np.nan))
+    assert [verdict.quality for verdict in fits.verdicts] == ["bad", "bad", "bad"]
     assert fits.verdicts[0].reasons == ("no ground above the noise",)
     assert "power" in fits.verdicts[1].reasons[0]
+    assert fits.verdicts[2].reasons == ("noise_std = 0; a fit needs a record with noise",)
     assert fits.retrievals is None
-    assert fits.numbers.tolist() == [-1, -1]
+    assert fits.numbers.tolist() == [-1, -1, -1]
     assert fits.fitted.shape == fits.signal.shape == fits.elevation.shape
 
 

@@ -106,7 +106,8 @@ def test_shots_of_any_length_share_programs_and_one_bad_shot_does_no_harm():
     damaged = [
         shot(2, waveform=np.full(900, np.nan)),
         shot(3, waveform=np.full(900, 200.0)),
-        shot(4, noise_std=0.0),
+        # A record without noise has no sample below its mean.
+        shot(4, random=np.random.default_rng(4), noise_std=0.0),
         shot(5, pulse_power=np.zeros(81)),
         shot(6, waveform=shot().waveform + 500.0),
         shot(7, time=np.arange(2.0), waveform=np.array([200.0, 201.0]), elevation=np.array([100.0, 99.85])),
@@ -131,6 +132,19 @@ def test_shots_of_any_length_share_programs_and_one_bad_shot_does_no_harm():
     assert table["quality"][-1] == "doubtful"
     assert "degrade" in table["reasons"][-1]
     assert str(progress[-1]).startswith("8 of 8 shots")
+
+
+def test_records_without_noise_are_not_judged_by_noise():
+    noiseless = shot(2, noise_std=0.0, waveform=shot().waveform.astype(np.float32).astype(float))
+    table = inversion.gedi_table([shot(1), noiseless])
+    assert table["quality"].tolist() == ["doubtful", "good"]
+    assert "uneven noise" in table["reasons"][0]
+    assert np.isnan(table["sensitivity"][1])
+    for name in ("ground", "elev_lowestmode", "cover", "pai"):
+        assert table[name][1] == pytest.approx(table[name][0], abs=0.02), name
+    # The signal's ends are those of lower thresholds.
+    np.testing.assert_allclose(table["rh"][1, 1:100], table["rh"][0, 1:100], atol=0.3)
+    assert 0.0 < table["rh"][1, 100] - table["rh"][0, 100] < 1.5
 
 
 @pytest.mark.parametrize(
