@@ -1,6 +1,7 @@
 """Reader of the places of footprints: text tables, and GEDI's levels 1B and 2A."""
 
 import os
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -9,6 +10,7 @@ import numpy as np
 from jaxtyping import Float, Int, Shaped
 
 from jaxlidar._fields.checks import warn_user
+from jaxlidar._fields.columns import warn_unread_columns
 from jaxlidar._fields.crs import transform
 from jaxlidar.formats.checks import MAX_COORDINATE, FileWarning
 from jaxlidar.formats.coordinates import GEOGRAPHIC
@@ -18,13 +20,14 @@ from jaxlidar.formats.text import parse_number, read_lines, split_cells
 
 # Beam of footprints whose file names none.
 _BEAM = "BEAM0101"
-# Names of columns of places, without case. That of shot numbers may be "id" where no other one is.
+# Names of columns of places, without case, spaces and underscores. That of shot numbers may be "id" where no
+# other one is.
 _COLUMNS = {
     "x": ("x", "easting", "east"),
     "y": ("y", "northing", "north"),
     "longitude": ("longitude", "lon", "lng"),
     "latitude": ("latitude", "lat"),
-    "shot_number": ("shot_number", "shot"),
+    "shot_number": ("shotnumber", "shot"),
     "beam": ("beam",),
 }
 _OTHER_NUMBER = "id"
@@ -56,8 +59,9 @@ def read_places(path: str | os.PathLike[str], crs: str) -> Places:
     - `path`: a file whose name ends in ".h5", or a text file of comma-, semicolon- or tab-separated values,
       whose first line names its columns: x and y (easting and northing) in m in `crs`, or longitude and
       latitude (lon, lat) in degrees on WGS-84; and where they are known shot_number (shot; id where neither
-      is), unique whole numbers up to 2^63 - 1, and beam, such as "BEAM0101", in any order and case. Other
-      columns are not read.
+      is), unique whole numbers up to 2^63 - 1, and beam, such as "BEAM0101", in any order and case, with
+      spaces or underscores. Other columns are not read; a `UserWarning` names those that nearly have the name
+      of one that is missing.
     - `crs`: coordinate reference system of x and y, in metres.
 
     **Returns:** a `Places`. Without shot numbers, rows are numbered from 1; without beams, all are of
@@ -109,12 +113,13 @@ def read_places(path: str | os.PathLike[str], crs: str) -> Places:
 
 
 def _columns(path: Path, names: list[str]) -> dict[str, int]:
-    """Return the number of the column of each quantity. **Raises:** as `read_places`."""
+    """Return the number of the column of each quantity. **Warns, raises:** as `read_places`."""
     columns = {}
+    bare_names = [re.sub(r"[\s_\-.]", "", name.lower()) for name in names]
     for quantity, known in _COLUMNS.items():
-        matches = [i for i, name in enumerate(names) if name.lower() in known]
+        matches = [i for i, name in enumerate(bare_names) if name in known]
         if quantity == "shot_number" and not matches:
-            matches = [i for i, name in enumerate(names) if name.lower() == _OTHER_NUMBER]
+            matches = [i for i, name in enumerate(bare_names) if name == _OTHER_NUMBER]
         if len(matches) > 1:
             raise ValueError(
                 f"{path}: line 1: {quantity} may be any of the columns "
@@ -134,6 +139,11 @@ def _columns(path: Path, names: list[str]) -> dict[str, int]:
                 f"{path}: line 1: no column {axis}; admissible are x and y in m, or longitude and latitude "
                 f"in degrees; there are {', '.join(names) or 'none'}"
             )
+    unread = [name for i, name in enumerate(names) if i not in columns.values()]
+    missing = {
+        quantity: _COLUMNS[quantity] for quantity in ("shot_number", "beam") if quantity not in columns
+    }
+    warn_unread_columns(f"{path}: line 1", unread, missing)
     return columns
 
 

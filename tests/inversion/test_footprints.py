@@ -45,6 +45,11 @@ def test_places_are_read_from_maps_and_from_longitude_and_latitude(tmp_path):
     # An id is that of something else where the shots have numbers.
     places = places_of(tmp_path, "id,shot_number,x,y\n1,19640119100108615,2,3\n2,9223372036854775807,2,4\n")
     assert places.shot_number.tolist() == [19640119100108615, 2**63 - 1]
+    assert places_of(tmp_path, "x,y,Shot Number\n1,2,7\n").shot_number.tolist() == [7]
+    with pytest.warns(
+        UserWarning, match=r"places.csv: line 1: columns are not read: 'shot_no' \(as shotnumber"
+    ):
+        places_of(tmp_path, "x,y,shot_no\n1,2,7\n")
 
 
 @pytest.mark.parametrize(
@@ -86,7 +91,7 @@ def test_mutants_of_tables_are_read_or_refused(tmp_path):
         path.write_bytes(change_text(random, table)[0])
         try:
             places = read_places(path, CRS)
-        except ValueError as error:
+        except (ValueError, UserWarning) as error:
             messages.append(str(error))
             continue
         assert np.isfinite(places.position).all()
