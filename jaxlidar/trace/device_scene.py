@@ -255,7 +255,7 @@ def _build_geometry(
     if scene.canopy is not None:
         medium = make_medium(scene.canopy, aim)
         leaf_law, bark_law = law_number(medium.leaf_phase), law_number(medium.bark_phase)
-    surfaces = traced_surfaces(scene, aim)
+    surfaces = traced_surfaces(scene, aim, config.covers_fully)
     meshes = build_mesh_tree(scene.meshes, scene.period).moved(-aim) if scene.meshes else None
     surface_laws = tuple(law_number(s.law) for s in surfaces)
     # Rays of the first order sum their depths on their way down. A table that nothing reads is not free: its

@@ -137,3 +137,28 @@ def test_derivative_in_the_height_of_a_disc():
 
     slope = float(jax.grad(mean_time)(jnp.asarray(5.0)))
     assert slope == pytest.approx(-2 / jl.SPEED_OF_LIGHT, rel=1e-3)
+
+
+def test_a_derivative_by_coverage_says_what_a_plan_without_gaps_leaves_out():
+    """The return of a plate and the ground below it is c R + (1 - c + c T)^2 rho.
+
+    Planted: R, the derivative without the light that passes gaps, as of a plan for c = 1.
+    """
+
+    def scene_of(coverage):
+        plate = jl.Plate(height=2.0, reflectance=0.2, transmittance=0.5, coverage=coverage)
+        return jl.Scene(plates=(plate,), ground=jl.Ground(reflectance=0.5))
+
+    def derivative(coverage):
+        plan = jl.plan(jl.Lidar(), scene_of(coverage), max_orders=1, window=(-60.0, 40.0))
+
+        def total(coverage):
+            wave = jl.simulate(jl.Lidar(), scene_of(coverage), plan=plan, key=jax.random.key(0))
+            return wave.reflectance.sum()
+
+        # Not compiled as a whole: JAX then passes constants as numbers.
+        return float(jax.grad(total)(coverage))
+
+    assert derivative(0.9) == pytest.approx(0.2 - 2.0 * (1.0 - 0.9 + 0.9 * 0.5) * (1.0 - 0.5) * 0.5, rel=1e-3)
+    with pytest.warns(UserWarning, match="derivatives by the coverage of a plate leave out its gaps"):
+        assert derivative(1.0) == pytest.approx(0.2, rel=1e-3)

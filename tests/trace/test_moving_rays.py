@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 import jaxlidar as jl
+from tests.helpers import slow_unless
 
 KEYS, STEPS = 6, {"divergence": 0.1, "position": 0.1, "map": 0.1, "size": 0.05, "relief": 0.05}
 START = {"divergence": 2.0, "position": 0.0, "map": 0.0, "size": 1.0, "relief": 1.0}
@@ -81,3 +82,53 @@ def test_derivatives_agree_with_differences(zenith, has_canopy, has_terrain, nam
     assert np.all(np.abs(error) < margin), (exact.mean(axis=0), difference.mean(axis=0), stderr)
     wrong = 1.5 * exact.mean(axis=0) - difference.mean(axis=0)
     assert np.any(np.abs(wrong) > margin)
+
+
+# Terrain that is level to the west of x = 0 and rises by 45 degrees to the east.
+BEND = np.array([0.0, 0.0, 0.0, 10.0, 20.0])[:, None] * np.ones(2)
+RADIUS, OFFSET = 5.0, 1.0
+# Energy per metre of the line x = 0 across a footprint of this radius, whose middle is 1 m to the east.
+PER_METRE = {
+    "top-hat": 2.0 * np.sqrt(RADIUS**2 - OFFSET**2) / (np.pi * RADIUS**2),
+    "gaussian": np.sqrt(2.0 / np.pi) / RADIUS * np.exp(-2.0 * (OFFSET / RADIUS) ** 2),
+}
+
+
+@pytest.mark.parametrize(
+    ("profile", "from_sensor"),
+    slow_unless(
+        [("top-hat", False), ("gaussian", True)],
+        [("top-hat", False), ("gaussian", True), ("top-hat", True), ("gaussian", False)],
+    ),
+)
+def test_the_return_changes_as_a_footprint_moves_over_a_bend(profile, from_sensor):
+    """By rho (cos 45 - 1) times the energy that crosses the bend: only the slope differs on both sides.
+
+    Planted: 0, the derivative of rays that move with the beam.
+    """
+    scene = jl.Scene(ground=jl.Terrain(BEND, spacing=(10.0, 80.0), origin=(-20.0, -40.0), reflectance=0.5))
+    beam = {"divergence": 2.0 * RADIUS, "profile": profile}
+
+    def lidar_at(x):
+        place = jnp.stack([x, jnp.zeros_like(x)])
+        if from_sensor:
+            return jl.Lidar(**beam, sensor=jnp.append(place, 1000.0))
+        return jl.Lidar(**beam, altitude=1000.0, position=place)
+
+    window = (6500.0, 6900.0) if from_sensor else (-150.0, 150.0)
+    start = jnp.asarray(OFFSET)
+    plan = jl.plan(lidar_at(start), scene, max_orders=1, n_rays=4096, window=window)
+
+    @jax.jit
+    def derivative(key):
+        def total(x):
+            return jl.simulate(lidar_at(x), scene, plan=plan, key=key).reflectance.sum()
+
+        return jax.grad(total)(start)
+
+    by_key = np.array([derivative(key) for key in jax.random.split(jax.random.key(1), 12)])
+    expected = 0.5 * (np.sqrt(0.5) - 1.0) * PER_METRE[profile]
+    # Rays of the beam's cone meet the slope a little farther up or down.
+    allowance = 4.0 * by_key.std(ddof=1) / np.sqrt(by_key.size) + 0.01 * abs(expected)
+    assert abs(by_key.mean() - expected) < allowance
+    assert abs(expected) > 5.0 * allowance

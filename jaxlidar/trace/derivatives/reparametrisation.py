@@ -230,10 +230,11 @@ def has_moving_rays(scene: DeviceScene) -> bool:
     """Return True if derivatives are taken and the rays of the footprint move with the geometry.
 
     Over planes alone, where a quadrature rule takes their place, nothing jumps. Rays of a lidar that is
-    placed by its sensor, which may be level, need not land anywhere.
+    placed by its sensor, which may be level, keep a place on terrain alone.
     """
     may_jump = scene.config.n_rays > 1 and not scene.config.uses_quadrature
-    return scene.derivatives != "none" and may_jump and not scene.beam.from_sensor
+    has_place = not scene.beam.from_sensor or _terrain(scene) is not None
+    return scene.derivatives != "none" and may_jump and has_place
 
 
 def rays_with_grids(
@@ -243,8 +244,10 @@ def rays_with_grids(
 
     1. Rays of a Gaussian beam move with grids and terrain (`move_across_beam`). The beam itself does not
        move them: the ratio of its irradiance makes up for a change of its width, and for their motion.
-    2. The rim of a top-hat beam would not make up for it. Rays widen with the beam, and stay within its rim.
+    2. The rim of a top-hat beam would not make up for it. Rays widen with the beam, and stay within its rim;
+       away from the rim they move with grids and terrain.
     3. Where shapes state outlines, the motion is blended with that of these.
+    4. Rays of a lidar that is placed by its sensor stay where they are unless all of them meet terrain.
 
     **Returns:** positions across the beam, and the ratio of the density, each with their derivative alone
     changed.
@@ -254,19 +257,19 @@ def rays_with_grids(
     if not has_moving_rays(scene) or scene.beam.rectangle is not None:
         return across, one
     beam, outlines = scene.beam, _surfaces_with_outline(scene, across)
-    if beam.gaussian:
-        moved, area = move_across_beam(scene, across)
-        if outlines:
-            moved, area = _with_outlines(scene, outlines, across, (moved, area))
-        density = beam.irradiance(moved) * area
-    elif outlines:
-        moved, density = _with_outlines(scene, outlines, across, None)
-    else:
+    if not (beam.gaussian or outlines or _grids(scene)):
         return across, one
+    moved, area = move_across_beam(scene, across)
+    if outlines or not beam.gaussian:
+        moved, area = _with_rim_and_outlines(scene, outlines, across, (moved, area))
+    density = beam.irradiance(moved) * area if beam.gaussian else area
     # A beam without width has no profile that could make up for the motion.
-    has_width = beam.radius > _MIN_RADIUS
-    density = jnp.where(has_width, density, 1.0)
-    x, y = (with_derivative_of(a, jnp.where(has_width, b, a)) for a, b in zip(across, moved))
+    may_move = beam.radius > _MIN_RADIUS
+    if beam.from_sensor:
+        _, is_met = _landing(*jax.tree.map(detach, (scene, across)))
+        may_move &= jnp.all(is_met)
+    density = jnp.where(may_move, density, 1.0)
+    x, y = (with_derivative_of(a, jnp.where(may_move, b, a)) for a, b in zip(across, moved))
     return (x, y), with_derivative_of(one, density / jnp.maximum(detach(density), 1e-30))
 
 
@@ -295,54 +298,53 @@ class _Motion(NamedTuple):
     weight_slopes: tuple[Scalar, Scalar]
 
 
-def _with_outlines(
+def _with_rim_and_outlines(
     scene: DeviceScene,
     outlines: list[TracedSurface],
     across: tuple[Scalar, Scalar],
-    moved_with_grids: tuple[tuple[Scalar, Scalar], Scalar] | None,
+    moved_with_grids: tuple[tuple[Scalar, Scalar], Scalar],
 ) -> tuple[tuple[Scalar, Scalar], Scalar]:
-    """Blend the motion of points across the beam with the motions of outlines.
+    """Blend the motion of points across the beam with that of the rim of a top-hat beam and of outlines.
 
-    `moved_with_grids`: points and |dT/du| of `move_across_beam`; None for a top-hat beam, with whose radius
-    points move at first.
+    `moved_with_grids`: points and |dT/du| of `move_across_beam`.
 
-    **Returns:** points across the beam, and |dT/du|.
+    **Returns:** points across the beam, and |dT/du|, for a top-hat beam over that of its widening.
     """
     radius = jnp.maximum(detach(scene.beam.radius), _MIN_RADIUS)
     start, reach = jax.tree.map(detach, across), _OUTLINE_REACH * radius
     fixed_scene = jax.tree.map(detach, scene)
-    if moved_with_grids is None:
-        widening = scene.beam.radius / radius
-        base = (start[0] * widening, start[1] * widening)
-        zero = jnp.zeros_like(start[0])
-        displacement, divergence = (zero, zero), zero
+    (moved, area), beam, fixed_beam = moved_with_grids, scene.beam, fixed_scene.beam
+    # Points of a top-hat beam, which is round, widen with it, and motions are relative to that.
+    widening = jnp.ones_like(radius) if beam.gaussian else beam.radius / radius
 
-        def closeness(u: tuple[Scalar, Scalar]) -> Scalar:
-            to_rim = radius - jnp.sqrt(jnp.maximum(u[0] ** 2 + u[1] ** 2, 1e-12))
-            return 1.0 + _inverse_square(to_rim, reach)
+    def to_rim(u: tuple[Scalar, Scalar]) -> Scalar:
+        return 1.0 + _inverse_square(radius - jnp.sqrt(jnp.maximum(u[0] ** 2 + u[1] ** 2, 1e-12)), reach)
 
-    else:
-        moved, area = moved_with_grids
-        widening, base = 1.0, start
-        displacement = (moved[0] - start[0], moved[1] - start[1])
-        divergence = area / detach(area) - 1.0
+    def to_faces(u: tuple[Scalar, Scalar]) -> Scalar:
+        landing, _ = _landing(fixed_scene, u)
+        # Distances as they look from the sensor, in the plane across the beam.
+        slant_range = fixed_beam.slant_range
+        magnification = slant_range / (slant_range + dot(landing, fixed_beam.axis))
+        distances = [magnification * distance for distance in _distances_from_faces(fixed_scene, landing)]
+        weight = sum((_inverse_square(distance, reach) for distance in distances), jnp.zeros_like(u[0]))
+        return weight + 1.0 if beam.gaussian else weight
 
-        def closeness(u: tuple[Scalar, Scalar]) -> Scalar:
-            landing, _ = _landing(fixed_scene, u)
-            weight = jnp.ones_like(u[0])
-            for to_face in _distances_from_faces(fixed_scene, landing):
-                weight = weight + _inverse_square(to_face, reach)
-            return weight
-
-    motions = [_Motion(displacement, divergence, *_value_and_slopes(closeness, start))]
+    base, motions = (widening * start[0], widening * start[1]), []
+    if not beam.gaussian:
+        still = jnp.zeros_like(start[0])
+        motions.append(_Motion((still, still), still, *_value_and_slopes(to_rim, start)))
+    if beam.gaussian or _grids(scene):
+        displacement = (moved[0] - base[0], moved[1] - base[1])
+        divergence = area / detach(area) - widening * widening
+        motions.append(_Motion(displacement, divergence, *_value_and_slopes(to_faces, start)))
     for surface, fixed in zip(outlines, jax.tree.map(detach, outlines)):
 
         def distance(u: tuple[Scalar, Scalar], surface: TracedSurface = surface) -> Scalar:
-            u = (u[0] * widening, u[1] * widening)
-            return _distance_from_outline(scene.beam, surface, scene.limits.start_distance, u)
+            u = (widening * u[0], widening * u[1])
+            return _distance_from_outline(beam, surface, scene.limits.start_distance, u)
 
         def fixed_distance(u: tuple[Scalar, Scalar], surface: TracedSurface = fixed) -> Scalar:
-            return _distance_from_outline(fixed_scene.beam, surface, fixed_scene.limits.start_distance, u)
+            return _distance_from_outline(fixed_beam, surface, fixed_scene.limits.start_distance, u)
 
         motions.append(_outline_motion(distance, fixed_distance, start, reach))
     (x, y), divergence = _blend(motions)
@@ -465,7 +467,9 @@ def _terrain(scene: DeviceScene) -> HeightField | None:
 def _landing(scene: DeviceScene, across: tuple[Scalar, Scalar]) -> tuple[Vec, Bool[Array, "rays"]]:
     """Return where rays meet the terrain, or else the reference plane, and True for the terrain."""
     point, w, _ = scene.beam.ray(across)
-    to_plane, terrain = -point[2] / w[2], _terrain(scene)
+    terrain = _terrain(scene)
+    # Rays from a sensor may be level.
+    to_plane = jnp.zeros_like(w[2]) if scene.beam.from_sensor else -point[2] / w[2]
     if terrain is None:
         return along(point, w, to_plane), jnp.zeros(to_plane.shape, bool)
     start_distance = scene.limits.start_distance

@@ -178,7 +178,7 @@ def with_replay(
 
         return result, push
 
-    def pull_back_leaves(leaves: list[Array], varying: list[int], cotangent: Traced) -> list[Array]:
+    def pull_back_leaves(leaves: list[Any], varying: list[int], cotangent: Traced) -> list[Array]:
         """Return the cotangents of leaves: of tables of extinction by the replay, of others by JAX."""
         by_leaf: dict[int, Any] = {}
         if any(number in tables for number in varying):
@@ -198,8 +198,10 @@ def with_replay(
     def differentiable(leaves: list[Array]) -> Traced:
         return value(leaves)
 
-    def push_forward(primals: tuple[list[Array]], tangents: tuple[list[Any]]) -> tuple[Traced, Traced]:
-        leaves, tangent = primals[0], tangents[0]
+    def push_forward(primals: tuple[list[Any]], tangents: tuple[list[Any]]) -> tuple[Traced, Traced]:
+        tangent = tangents[0]
+        # JAX replaces constants of a program by numbers.
+        leaves = [a if isinstance(a, jax.Array) else jnp.asarray(a, a.dtype) for a in primals[0]]
         varying = _varying(leaves, tangent)
         tangents_of_varying = [tangent[i] for i in varying]
         if is_few(leaves, varying):
@@ -211,7 +213,7 @@ def with_replay(
         result = differentiable(leaves)
         results, result_structure = jax.tree.flatten(result)
 
-        def function(leaves: list[Array], tangents: list[Array]) -> list[Array]:
+        def function(leaves: list[Any], tangents: list[Array]) -> list[Array]:
             by_leaf = dict(zip(varying, tangents))
             of_tables = ExtinctionTables(*(by_leaf.get(number) for number in tables))
             has_tables = any(t is not None for t in of_tables)
@@ -228,7 +230,7 @@ def with_replay(
                 pushed = add_tangents(*scene_and_numbers(leaves, "none"), of_tables, pushed)
             return jax.tree.leaves(pushed)
 
-        def transpose(leaves: list[Array], cotangents: list[Array]) -> list[Array]:
+        def transpose(leaves: list[Any], cotangents: list[Array]) -> list[Array]:
             return pull_back_leaves(leaves, varying, jax.tree.unflatten(result_structure, cotangents))
 
         result_tangent = linear_map(function, transpose, leaves, tangents_of_varying, results)

@@ -6,6 +6,7 @@ material.
 """
 
 import dataclasses
+from functools import partial
 
 import equinox as eqx
 import jax
@@ -21,6 +22,15 @@ from jaxlidar.scenes.raster import Raster
 from jaxlidar.scenes.scene import Scene
 from jaxlidar.scenes.shapes import AbstractShape, OutlineWarning, Plane
 from jaxlidar.scenes.surfaces import AbstractSheet, AbstractSurface
+
+_NO_OUTLINE = (
+    "derivatives through a shape without the method `outline` leave out how light comes to meet it or to "
+    "miss it as it moves or grows: see jaxlidar.AbstractShape.outline"
+)
+_NO_GAPS = (
+    "derivatives by the coverage of a plate leave out its gaps, which a plan for coverage = 1 does not "
+    "trace: make the plan with a coverage below 1, and take the derivative there"
+)
 
 
 class TracedSurface(eqx.Module):
@@ -68,7 +78,7 @@ class TracedSurface(eqx.Module):
         assert self.shape is not None
         s = self.shape.distance(x, w)
         if self.may_have_outline and self.shape.outline(x, w) is None:
-            s = _warn_if_differentiated(s)
+            s = _warn_if_differentiated(_NO_OUTLINE, OutlineWarning, s)
         if self.is_plate:
             return s
         # Ground seen from below is no ground: a ray that starts under the terrain by rounding must not end
@@ -95,34 +105,38 @@ class TracedSurface(eqx.Module):
         return value if self.pattern is None else value * self.pattern.value(x)
 
 
-@jax.custom_jvp
-def _warn_if_differentiated(distance: Scalar) -> Scalar:
-    """Return the distance to a shape that states no outline; warn once where its derivative is taken."""
-    return distance
+@partial(jax.custom_jvp, nondiff_argnums=(0, 1))
+def _warn_if_differentiated(message: str, category: type[UserWarning], value: Scalar) -> Scalar:
+    """Return a value; warn once where its derivative is taken."""
+    return value
 
 
 @_warn_if_differentiated.defjvp
-def _(primals, tangents):
-    # JAX calls this rule only where the distance depends on what is differentiated by.
-    message = (
-        "derivatives through a shape without the method `outline` leave out how light comes to meet it or to "
-        "miss it as it moves or grows: see jaxlidar.AbstractShape.outline"
-    )
-    warn_user(message, OutlineWarning)
+def _(message, category, primals, tangents):
+    # JAX calls this rule only where the value depends on what is differentiated by.
+    warn_user(message, category)
     return primals[0], tangents[0]
 
 
-def traced_surfaces(scene: Scene, aim: Float[Array, "3"]) -> tuple[TracedSurface, ...]:
-    """Return the surfaces of a scene, ground first, then plates and meshes, relative to the aim point."""
+def traced_surfaces(
+    scene: Scene, aim: Float[Array, "3"], covers_fully: tuple[bool, ...]
+) -> tuple[TracedSurface, ...]:
+    """Return the surfaces of a scene, ground first, then plates and meshes, relative to the aim point.
+
+    `covers_fully`: that of `TraceConfig`.
+    """
     one = jnp.ones_like(aim[0])
 
-    def traced(surface: AbstractSurface) -> TracedSurface:
+    def traced(surface: AbstractSurface, covers_fully: bool) -> TracedSurface:
         if isinstance(surface, MeshMaterial):
             return TracedSurface(None, one, surface.law, None, False, False)
         result = TracedSurface(surface.shape, one, surface.law, surface.pattern, False, False)
         if isinstance(surface, AbstractSheet):
             straight = surface.transmission == "straight"
-            result = dataclasses.replace(result, coverage=surface.coverage, is_plate=True, straight=straight)
+            coverage: Array = surface.coverage
+            if covers_fully:
+                coverage = _warn_if_differentiated(_NO_GAPS, UserWarning, coverage)
+            result = dataclasses.replace(result, coverage=coverage, is_plate=True, straight=straight)
         return result.moved(-aim)
 
-    return tuple(traced(surface) for surface in scene.surfaces)
+    return tuple(traced(*surface) for surface in zip(scene.surfaces, covers_fully, strict=True))
