@@ -17,6 +17,8 @@ from jaxlidar._fields.checks import (
     check_range,
     concrete_array,
     concrete_number,
+    has_tracers,
+    is_within_program,
 )
 from jaxlidar._jax.programs import Program
 from jaxlidar._jax.threads import side_by_side
@@ -116,13 +118,14 @@ def energy_budget(
     - `progress`: True for a bar with the error and the time left; or a function called with a `Progress`
       after every round. Default None: silent.
 
-    An interrupt (Ctrl-C) after eight batches ends it with the batches that are done.
+    An interrupt (Ctrl-C) after eight batches ends it with the batches that are done. It has no derivatives;
+    `Waveform.energy_budget` has.
 
     **Returns:** an `EnergyBudget`.
 
     **Raises:** ValueError for values outside their ranges, and for parallel light where the canopy has open
-    sides; TypeError for arguments of another kind; KeyboardInterrupt where it is interrupted before eight
-    batches.
+    sides; TypeError for arguments of another kind, and inside a JAX transformation; KeyboardInterrupt where
+    it is interrupted before eight batches.
 
     **Example:**
 
@@ -135,6 +138,12 @@ def energy_budget(
     """
     check_kinds(lidar, scene)
     check_key(key)
+    if is_within_program() or has_tracers((lidar, scene, key)):
+        raise TypeError(
+            "energy_budget cannot run inside a JAX transformation (jit, grad, vmap, ...): it traces until "
+            "the tolerance is met. Call it outside, or use Waveform.energy_budget of simulate with a plan "
+            "that is made outside"
+        )
     check_range("rtol", rtol, 0.0, 1.0, low_open=True, high_open=True)
     check_choice("illumination", illumination, ("beam", "parallel"))
     max_orders = check_integer("max_orders", max_orders)

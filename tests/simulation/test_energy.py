@@ -129,6 +129,15 @@ def test_bad_input(arguments, message):
         jl.energy_budget(jl.Lidar(), jl.Scene(plates=(PLATE,)), key=KEY, **arguments)
 
 
+def test_a_jax_transformation_is_refused_with_its_cause():
+    def returned(reflectance):
+        scene = jl.Scene(ground=jl.Ground(reflectance=reflectance))
+        return jl.energy_budget(jl.Lidar(), scene, key=KEY).returned[0]
+
+    with pytest.raises(TypeError, match=r"cannot run inside a JAX transformation .*Waveform\.energy_budget"):
+        jax.grad(returned)(0.3)
+
+
 def test_an_interrupt_keeps_finished_batches():
     scene = jl.Scene(ground=jl.Ground(reflectance=0.4), plates=(PLATE,))
     messages = []
