@@ -127,7 +127,7 @@ def scene(
         entries.append(ax.fill_between(*profile, fill_bottom, **fill))
     if lidar is not None:
         length = 2.0 * (top - bottom + margin + np.linalg.norm(np.ptp(boxes[0], axis=0)) + high - low)
-        entries += _draw_beam(ax, lidar, across, (bottom, top + 10 * margin), length)
+        entries += _draw_beam(ax, lidar, across, (bottom, top + 10 * margin), float(length))
     ax.set_xlim(low, high)
     ax.set_ylim(bottom - margin, top + margin)
     ax.set_aspect("equal")
