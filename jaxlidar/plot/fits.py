@@ -163,6 +163,7 @@ def fit(
             waveform_axes.plot(values, height, color=colour, label=name, **look)
     limit_height(waveform_axes, height, np.fmax(model, data)[rows])
     waveform_axes.set_xlabel("apparent reflectance\nper sample")
+    waveform_axes.ticklabel_format(axis="x", style="sci", scilimits=(-2, 3), useMathText=True)
     # The residuals name the colours of wavelengths.
     handles = [Line2D([], [], color=TOTAL_COLOUR, label=name, **look) for name, look in looks.items()]
     _add_legend(waveform_axes, handles=handles)
