@@ -61,7 +61,7 @@ FAULTS = {
         "trace/device_scene.py",
         "laws = jax.tree.map(jax.lax.stop_gradient, self.laws)",
         "laws = self.laws",
-        "trace/test_derivatives_of_heights.py",
+        "optics/test_laws.py",
     ),
     "paths in and out exchanged for the hot spot": Fault(
         "trace/first/first_order.py",

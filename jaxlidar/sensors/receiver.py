@@ -153,13 +153,12 @@ def record(
     if it were absent (a straight-through estimate). They pass through the noise of a realisation with its
     draws held fixed, so not through Poisson counts.
 
-    **Raises:** ValueError where a waveform was recorded by a receiver that is not given, where the energies
-    have fewer than two axes, for infinite energies, for negative
-    ones in an array, and where those of a waveform take more than 1 % from it; for wavelengths that are not
-    positive, and for neither one nor one per row of the energies; for a noise model without a key, or that
-    returns another shape than that of the energies; TypeError for an object of the wrong type. Inside a JAX
-    transformation, where values cannot be refused, such samples become NaN: the negative or infinite ones of
-    an array, all of a waveform.
+    **Raises:** ValueError for a waveform of another receiver than the default, where none is given; where the
+    energies have fewer than two axes, for infinite energies, for negative ones in an array, and where those
+    of a waveform take more than 1 % from it; for wavelengths that are not positive, and for neither one nor
+    one per row of the energies; for a noise model without a key, or that returns another shape than that of
+    the energies; TypeError for an object of the wrong type. Inside a JAX transformation, where values cannot
+    be refused, such samples become NaN: the negative or infinite ones of an array, all of a waveform.
 
     **Example:**
 

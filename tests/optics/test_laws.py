@@ -252,6 +252,38 @@ def test_a_density_that_is_wrong_spoils_derivatives_visibly():
     assert abs(error) > 6 * stderr
 
 
+def test_the_anisotropy_of_leaves_above_ground_is_counted_once():
+    """Photons that leaves send to the ground under voxels: z-test against differences of converged means.
+
+    Planted: the derivative of their density twice, when they are sent on and when their landing points move.
+    """
+    voxels = jl.VoxelMap.from_lad(np.full((12, 12, 2), 0.4), voxel_size=1.0, origin=(-6.0, -6.0, 3.0))
+    lidar, ground, g, step = jl.Lidar(divergence=3.0), jl.Ground(reflectance=0.5), 0.3, 0.05
+
+    def scene_of(g):
+        return jl.Scene(canopy=jl.Canopy(voxels, leaf=jl.HenyeyGreenstein(0.8, g)), ground=ground)
+
+    plan = jl.plan(lidar, scene_of(g), max_orders=2, window=(-90.0, 80.0), n_photons=16384, n_rays=64)
+
+    @jax.jit
+    def value_and_derivative(g, key):
+        def from_ground(g):
+            wave = jl.simulate(lidar, scene_of(g), plan=plan, key=key)
+            return wave.components["ground"].sum()
+
+        return jax.jvp(from_ground, (g,), (1.0,))
+
+    keys = jax.random.split(jax.random.key(3), 16)
+    derivative = np.array([value_and_derivative(g, key)[1] for key in keys[:8]])
+    upper, lower = (
+        np.array([value_and_derivative(g + s, key)[0] for key in keys[8:]]) for s in (step, -step)
+    )
+    difference = (upper - lower) / (2.0 * step)
+    stderr = np.hypot(*(x.std(ddof=1) / np.sqrt(x.size) for x in (derivative, difference)))
+    assert abs(derivative.mean() - difference.mean()) < 4.0 * stderr
+    assert abs(2.0 * derivative.mean() - difference.mean()) > 20.0 * stderr
+
+
 def total_return(wave):
     """Apparent reflectance of the whole record, by wavelength."""
     return wave.reflectance.sum(axis=1)

@@ -15,7 +15,7 @@ import pytest
 import jaxlidar as jl
 from jaxlidar.trace.derivatives import higher_order_replay, replay
 from jaxlidar.trace.device_scene import build_device_scene
-from tests.helpers import agrees
+from tests.helpers import agrees, slow_unless
 
 RANDOM = np.random.default_rng(0)
 LEAF = RANDOM.uniform(0.1, 1.0, (3, 3, 4)) * (RANDOM.uniform(size=(3, 3, 4)) < 0.6)
@@ -351,3 +351,25 @@ def test_first_order_alone_has_no_table_of_vertical_depths():
         device_scene = build_device_scene(jl.make_setup(lidar, scene, plan), derivatives="all")
         is_built.append(device_scene.depth_above is not None)
     assert is_built == [False, True]
+
+
+@pytest.mark.parametrize("zenith", slow_unless([150.0], [150.0, 180.0]))
+def test_reverse_mode_is_forward_mode_for_a_sensor_below_its_canopy(zenith):
+    """Some photons meet nothing, and stay at the sensor: they have no direction to it."""
+    voxels = jl.VoxelMap.from_lad(
+        np.full((2, 2, 2), 0.5), voxel_size=(2.0, 2.0, 1.0), origin=(-2.0, -2.0, 3.0)
+    )
+    scene = jl.Scene(canopy=jl.Canopy(voxels, leaf=jl.LeafOptics(0.45, 0.4)))
+
+    def lidar_at(zenith):
+        return jl.Lidar(sensor=(0.3, 0.2, 0.5), zenith=zenith, azimuth=10.0, divergence=2.0)
+
+    plan = jl.plan(lidar_at(179.0), scene, max_orders=2, window=(0.0, 150.0), n_photons=2048, n_rays=64)
+
+    def higher(zenith):
+        wave = jl.simulate(lidar_at(zenith), scene, plan=plan, key=jax.random.key(0))
+        return wave.components["higher"].sum()
+
+    reverse, forward = (jax.jit(d(higher))(zenith) for d in (jax.grad, jax.jacfwd))
+    assert np.isfinite(forward)
+    np.testing.assert_allclose(reverse, forward, rtol=1e-3, atol=1e-9)

@@ -25,7 +25,8 @@ included; where they do not, the integrand must be continuous. For higher orders
 - The longest flight: beyond it nothing is recorded, and the response has fallen to zero before. Photons that
   end in the medium must not take part in the motion of landings: they would carry a response that is not
   zero across this border, and across the direction in which a surface ends.
-- The horizon of a surface: the density of landings, proportional to the cosine, falls to zero there.
+- The horizon of a surface: the density of landings, proportional to the cosine, falls to zero there. That of
+  a law such as `EqualAngle` does not: derivatives by the tilt of its surface lack the motion of the horizon.
 - The outlines of shapes and of meshes, and ridges that hide what lies behind them: not covered in higher
   orders; derivatives lack the light that appears and disappears there.
 
@@ -259,14 +260,13 @@ def rays_with_grids(
     beam, outlines = scene.beam, _surfaces_with_outline(scene, across)
     if not (beam.gaussian or outlines or _grids(scene)):
         return across, one
-    moved, area = move_across_beam(scene, across)
+    moved, area, is_met = move_across_beam(scene, across)
     if outlines or not beam.gaussian:
         moved, area = _with_rim_and_outlines(scene, outlines, across, (moved, area))
     density = beam.irradiance(moved) * area if beam.gaussian else area
     # A beam without width has no profile that could make up for the motion.
     may_move = beam.radius > _MIN_RADIUS
     if beam.from_sensor:
-        _, is_met = _landing(*jax.tree.map(detach, (scene, across)))
         may_move &= jnp.all(is_met)
     density = jnp.where(may_move, density, 1.0)
     x, y = (with_derivative_of(a, jnp.where(may_move, b, a)) for a, b in zip(across, moved))
@@ -427,7 +427,7 @@ def _value_and_slopes(
 
 def move_across_beam(
     scene: DeviceScene, across: tuple[Scalar, Scalar]
-) -> tuple[tuple[Scalar, Scalar], Scalar]:
+) -> tuple[tuple[Scalar, Scalar], Scalar, Bool[Array, "rays"]]:
     """Move points across the beam so that the rays through them land at the same places among grid faces.
 
     The optical depth of a nearly vertical ray jumps where it crosses into another column, so that its
@@ -440,7 +440,7 @@ def move_across_beam(
     3. Its central projection from the sensor onto the plane across the beam.
     4. |dT/du|, up to a constant: the area between faces, projected onto that plane.
 
-    **Returns:** points across the beam, and |dT/du|.
+    **Returns:** points across the beam, |dT/du|, and True for rays that meet terrain.
     """
     beam, terrain = scene.beam, _terrain(scene)
     landing, is_met = _landing(*jax.tree.map(detach, (scene, across)))
@@ -455,7 +455,7 @@ def move_across_beam(
     moved = (in_beam[0] * magnification, in_beam[1] * magnification)
     _, direction, _ = beam.ray(moved)
     cosine = jnp.abs(direction[2] - slope_x * direction[0] - slope_y * direction[1])
-    return moved, widths[0] * widths[1] * cosine * magnification**2
+    return moved, widths[0] * widths[1] * cosine * magnification**2, is_met
 
 
 def _terrain(scene: DeviceScene) -> HeightField | None:

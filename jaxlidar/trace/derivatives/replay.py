@@ -138,9 +138,6 @@ def with_replay(
         scene, numbers = eqx.combine(jax.tree.unflatten(treedef, leaves), static)
         return dataclasses.replace(scene, derivatives=derivatives), numbers
 
-    def value(leaves: list[Array]) -> Traced:
-        return trace(*scene_and_numbers(leaves, "none"))
-
     # The position of every table among the leaves.
     numbered: Any = eqx.combine(jax.tree.unflatten(treedef, range(len(leaves))), static)[0]
     tables: Any = ExtinctionTables.of(numbered)
@@ -165,7 +162,7 @@ def with_replay(
         def along(direction: Float[Array, "numbers"]) -> tuple[Traced, Traced]:
             return jax.jvp(lambda numbers: of_varying(to_values(numbers)), (numbers,), (direction,))
 
-        # One direction is no batch, which would take twice the time.
+        # A single direction needs no batch.
         if numbers.size == 1:
             result, derivative = along(jnp.ones_like(numbers))
             derivatives = jax.tree.map(lambda d: d[None], derivative)
@@ -196,7 +193,7 @@ def with_replay(
 
     @jax.custom_jvp
     def differentiable(leaves: list[Array]) -> Traced:
-        return value(leaves)
+        return trace(*scene_and_numbers(leaves, "none"))
 
     def push_forward(primals: tuple[list[Any]], tangents: tuple[list[Any]]) -> tuple[Traced, Traced]:
         tangent = tangents[0]
