@@ -35,7 +35,7 @@ def blocks(path, language):
 LONG = {
     "README.md": {3},
     "jaxlidar/README.md": {0, 1, 2, 3, 5, 8, 9},
-    "inversion/README.md": {2, 3, 4},
+    "inversion/README.md": {2, 3, 4, 5},
 }
 EXAMPLES = [
     pytest.param(path, number, marks=pytest.mark.slow if number in LONG.get(page_name(path), ()) else ())

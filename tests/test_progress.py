@@ -7,6 +7,7 @@ import pytest
 import inversion
 import jaxlidar as jl
 from jaxlidar.progress import shows_progress
+from tests.helpers import slow_unless
 
 KEY = jax.random.key(0)
 SCENE = jl.Scene(plates=[jl.Plate(2.0, 0.3, 0.3)], ground=jl.Ground(reflectance=0.4))
@@ -31,7 +32,7 @@ CALLS = {
 }
 
 
-@pytest.mark.parametrize("name", CALLS)
+@pytest.mark.parametrize("name", slow_unless(["simulate", "retrieve"], CALLS))
 def test_true_shows_a_bar_and_none_is_silent(name, capfd):
     call, text = CALLS[name]
     call(None)

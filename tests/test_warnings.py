@@ -46,6 +46,7 @@ def test_a_survey():
     assert "jl.simulate_many(" in line_of_warning(call, jl.LateLightWarning)
 
 
+@pytest.mark.slow
 def test_a_survey_that_leaves_the_map():
     voxels = jl.VoxelMap.from_lad(np.full((4, 4, 2), 0.5), voxel_size=1.0)
     scene = jl.Scene(canopy=jl.Canopy(voxels, leaf=jl.LeafOptics(0.4, 0.4)), ground=jl.Ground())
@@ -132,6 +133,7 @@ def simulated(survey, scene):
     return jl.simulate_many(survey, scene, key=KEY, rtol=0.3, max_orders=1)
 
 
+@pytest.mark.slow
 def test_returns_of_crowns_alone():
     """Shots upwards into voxels are told."""
     many = simulated(UPWARDS, crown())

@@ -252,6 +252,7 @@ def test_a_density_that_is_wrong_spoils_derivatives_visibly():
     assert abs(error) > 6 * stderr
 
 
+@pytest.mark.slow
 def test_the_anisotropy_of_leaves_above_ground_is_counted_once():
     """Photons that leaves send to the ground under voxels: z-test against differences of converged means.
 

@@ -268,7 +268,7 @@ def test_a_scene_far_from_every_beam_is_of_another_map(kind):
 
 PLANS_AS_ARGUMENTS = {
     "simulate": (
-        lambda scene: jl.plan(LIDAR_OF_PLANS, scene, max_orders=2, n_photons=2048, describe=False),
+        lambda scene: jl.plan(LIDAR_OF_PLANS, scene, max_orders=1, n_rays=256, describe=False),
         lambda scene, plan: jl.simulate(LIDAR_OF_PLANS, scene, key=KEY_OF_PLANS, plan=plan).reflectance,
     ),
     "truth_of": (

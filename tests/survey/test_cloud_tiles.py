@@ -100,6 +100,7 @@ def test_ground_without_returns_is_black_and_shots_outside_are_in_no_tile(halves
     assert components["leaf"] > 0.05
 
 
+@pytest.mark.slow
 def test_an_interrupted_run_goes_on_with_the_same_bits(halves, tmp_path, monkeypatch):
     survey, options = survey_at(*BORDERS[:3]), {"key": KEY, "tile": 20.0, "rtol": 0.1}
     parts = jl.simulate_tiles(halves, survey, tmp_path / "whole", **options)

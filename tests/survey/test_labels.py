@@ -345,6 +345,7 @@ def test_inadmissible_input_is_refused(make, error, message):
         make()
 
 
+@pytest.mark.slow
 def test_another_survey_or_scene_is_warned_of():
     """Returns whose surfaces are not met are counted; those of the survey itself are all met."""
     survey = jl.Survey.grid(jl.Lidar(altitude=300.0, **SHARP), (-4, 0), (4, 0), 2.0)

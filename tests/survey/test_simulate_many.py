@@ -615,6 +615,7 @@ def test_an_interrupt_says_where_finished_shots_are(tmp_path, monkeypatch):
     assert "a.zarr: the same call continues" in interrupt.value.__notes__[0]
 
 
+@pytest.mark.slow
 def test_a_tree_on_a_lawn_is_not_cut_off():
     survey = jl.Survey(lidar(), [(2.0, 2.0), (20.0, 0.0)])
     lad = np.zeros((4, 4, 2))

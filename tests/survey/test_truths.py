@@ -97,6 +97,7 @@ def test_truths_are_stored_in_files_and_a_killed_run_continues(waveforms, tmp_pa
         jl.simulate_many(OBLIQUE, SCENE, **OPTIONS | {"truth": False}, path=path)
 
 
+@pytest.mark.slow
 def test_damaged_files_are_refused(waveforms, tmp_path):
     path = tmp_path / "many.nc"
     waveforms.save(path)

@@ -17,6 +17,7 @@ import jaxlidar as jl
 from jaxlidar._vectors import vec
 from jaxlidar.scenes.mesh_surface import build_mesh_tree
 from jaxlidar.spectral.apply_optics import budget_excess, refuse_excess
+from tests.helpers import slow_unless
 
 GROUND = 0.3
 
@@ -37,7 +38,7 @@ def grounds(slope=0.0):
     return [plane, jl.Terrain(heights, spacing=100.0, origin=(-200.0, -200.0), reflectance=GROUND)]
 
 
-@pytest.mark.parametrize("height", [-1e-5, 0.0, 1e-6])
+@pytest.mark.parametrize("height", slow_unless([0.0], [-1e-5, 0.0, 1e-6]))
 @pytest.mark.parametrize("zenith", [0.0, pytest.param(70.0, marks=pytest.mark.slow)])
 def test_an_opaque_mesh_in_the_ground_hides_it(height, zenith):
     lidar = jl.Lidar(zenith=zenith)
@@ -158,6 +159,7 @@ def test_a_mesh_of_the_terrain_s_own_heights_is_refused(change):
         jl.Scene(ground=terrain, meshes=(mesh,))
 
 
+@pytest.mark.slow
 def test_a_mesh_of_nearly_level_terrain_is_met_before_it():
     terrain, mesh = draped(1e-5, origin=(-16.0, -16.0))
     wave = jl.simulate(
@@ -167,6 +169,7 @@ def test_a_mesh_of_nearly_level_terrain_is_met_before_it():
     assert float(wave.components["ground"].sum()) == 0.0
 
 
+@pytest.mark.slow
 def test_copies_of_a_mesh_in_one_place_count_once():
     reflectance, transmittance = 0.5, 0.4
     expected = reflectance + transmittance**2 * GROUND / (1.0 - reflectance * GROUND)
@@ -189,6 +192,7 @@ def test_a_sensor_in_a_triangle_is_refused(offset):
     jl.plan(jl.Lidar(sensor=(70.0, 2.0, 5.0 + offset)), scene)
 
 
+@pytest.mark.slow
 def test_an_energy_budget_of_more_than_the_light_is_an_error(monkeypatch):
     budget, stderr = (
         {"returned": jnp.array([0.7]), "escaped": jnp.array([0.5])},

@@ -85,6 +85,7 @@ def beyond_edge(normal, distance, w1=0.5e-3 * VERTICAL * 500.0, w2=0.5e-3 * LEVE
     return 0.5 * math.erfc(math.sqrt(2.0) * distance / math.hypot(normal[0] * w1, normal[1] * w2))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("placed_by", "zenith"),
     [
@@ -118,6 +119,7 @@ def test_equal_divergences_are_a_round_beam():
     assert round_beam.ellipse is None
 
 
+@pytest.mark.slow
 def test_higher_orders_enter_over_the_ellipse():
     """Half a plane of leaves returns that share of a whole one, of all orders, which the footprint lights."""
     voxels = jl.VoxelMap.from_lad(

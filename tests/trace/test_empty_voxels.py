@@ -111,6 +111,7 @@ CASES = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "build", "material", "options"), CASES)
 def test_gradients_are_those_of_differences(name, build, material, options, monkeypatch):
     voxels = np.argwhere((LEAF, BARK)[material] == 0.0)[[0, 6]]

@@ -66,6 +66,7 @@ def test_the_record():
     np.testing.assert_allclose(forward, [1.0, 0.6], rtol=0.02)
 
 
+@pytest.mark.slow
 def test_lidar_and_scene():
     # A wrong pulse or slope leaves a residual: one of second order at the middle of the differences.
     check(lambda fwhm: estimates(RECORD, fwhm=fwhm), jnp.asarray(4.0), 0.2, 0.01)

@@ -31,7 +31,7 @@ def hard_targets(ratio, shots=20):
     return times, clean + random.normal(size=clean.shape) / ratio
 
 
-@pytest.mark.parametrize("ratio", slow_unless([5.0, 1000.0], [5.0, 30.0, 200.0, 1000.0]))
+@pytest.mark.parametrize("ratio", slow_unless([1000.0], [5.0, 30.0, 200.0, 1000.0]))
 def test_a_hard_target_has_one_echo(ratio):
     times, power = hard_targets(ratio)
     echoes = gaussian_decomposition(TIME, power, noise=1 / ratio, pulse=impulse(LAG))
