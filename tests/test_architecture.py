@@ -323,6 +323,15 @@ def test_importing_leaves_the_configuration_alone():
     subprocess.run([sys.executable, "-c", code], check=True, cwd=ROOT)
 
 
+def test_importing_reads_no_part_of_scipy():
+    """They are read where they are used first, as `scipy.linalg`: a first waveform needs none of them."""
+    code = (
+        "import sys, jaxlidar, inversion; "
+        "assert not {'scipy.linalg', 'scipy.ndimage', 'scipy.sparse', 'scipy.spatial'} & {*sys.modules}"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True, cwd=ROOT)
+
+
 def test_rows_of_a_vmapped_product_are_right():
     """A canary: some releases of jax computed wrong rows of this on the CPU."""
     random = np.random.default_rng(0)

@@ -44,7 +44,6 @@ import jax
 import numpy as np
 import scipy
 from jaxtyping import ArrayLike, Bool, Float, Int, PRNGKeyArray
-from scipy.sparse import linalg as sparse_linalg
 
 from inversion.fit.data import as_noise, as_sample_times, with_fixed_window
 from inversion.fit.planning import N_BATCHES, plan_for_bounds
@@ -525,10 +524,12 @@ class _Problem:
             return free * self.product(end.x, free * v) + (1.0 - free) * v
 
         # SciPy's stubs know the constructor of the base class alone, without its functions.
-        operator: Any = sparse_linalg.LinearOperator
+        operator: Any = scipy.sparse.linalg.LinearOperator
         matrix = operator((n, n), matvec=product, dtype=float)
         inverse_diagonal = operator((n, n), matvec=lambda v: end.scale**2 * v, dtype=float)
-        return sparse_linalg.cg(matrix, free * b, rtol=_CG_RTOL, maxiter=_CG_STEPS, M=inverse_diagonal)[0]
+        tolerance = {"rtol": _CG_RTOL, "maxiter": _CG_STEPS}
+        solution, _ = scipy.sparse.linalg.cg(matrix, free * b, M=inverse_diagonal, **tolerance)
+        return solution
 
 
 def _best_gains(

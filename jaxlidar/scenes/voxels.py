@@ -16,7 +16,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy
-import scipy.sparse
 from jaxtyping import Array, ArrayLike, Float
 
 from jaxlidar._fields.checks import (
@@ -444,7 +443,7 @@ class _Place(NamedTuple):
 
     def _turned_shares(
         self, origin: Float[np.ndarray, "2"], size: Float[np.ndarray, "2"], shape: tuple[int, int]
-    ) -> scipy.sparse.csr_array:
+    ) -> "scipy.sparse.csr_array":
         """Return the share of each column of turned voxels in each column of another grid, by points."""
         nx, ny, _ = self.shape
         # As many along an edge as leave no column of the other grid without a point.
@@ -472,7 +471,9 @@ def _turned(points: Float[np.ndarray, "n 2"], azimuth: float) -> Float[np.ndarra
     return points @ np.array([[cosine, -sine], [sine, cosine]])
 
 
-def _shares(faces: Float[np.ndarray, " n"], origin: float, size: float, count: int) -> scipy.sparse.coo_array:
+def _shares(
+    faces: Float[np.ndarray, " n"], origin: float, size: float, count: int
+) -> "scipy.sparse.coo_array":
     """Return the share of each interval between faces that lies in each of `count` cells of a size."""
     lowest = np.floor((faces[:-1] - origin) / size + _FACE_TOLERANCE).astype(int)
     most = int(np.ceil((faces[1] - faces[0]) / size)) + 1

@@ -30,8 +30,8 @@ from typing import Any, NamedTuple
 
 import jax
 import numpy as np
+import scipy
 from jaxtyping import Bool, Float, Int, PRNGKeyArray
-from scipy.spatial import KDTree
 
 from jaxlidar._fields.checks import check_key, check_kind, check_number
 from jaxlidar._fields.crs import common_system
@@ -345,7 +345,7 @@ def _is_near(points: PointCloud, axes: list[np.ndarray]) -> Bool[np.ndarray, "nx
     places = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
     # Relative to one of them: map coordinates are large.
     origin = places[0, 0]
-    distance, _ = KDTree(points.position[:, :2] - origin).query(
+    distance, _ = scipy.spatial.KDTree(points.position[:, :2] - origin).query(
         places - origin, distance_upper_bound=_LARGEST_GAP
     )
     return np.isfinite(distance)

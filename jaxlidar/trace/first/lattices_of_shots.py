@@ -16,7 +16,7 @@ from typing import NamedTuple, TypeVar
 import jax
 import jax.numpy as jnp
 import numpy as np
-import scipy.linalg
+import scipy
 from jax.scipy.special import ndtr
 from jaxtyping import Array, Bool, Float, Int
 
