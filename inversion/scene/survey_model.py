@@ -35,8 +35,9 @@ from jax import lax
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from inversion.fit.model import check_position
+from inversion.fit.planning import corner_cases
 from inversion.fit.unknowns import BoundUnknown, Setter, set_values
-from jaxlidar import Lidar, Plan, Scene, Survey, make_setup
+from jaxlidar import Lidar, Plan, Scene, Survey, VoxelMap, make_setup
 from jaxlidar.extend import Program, side_by_side
 from jaxlidar.spectral.apply_optics import make_waveform_model, total_samples
 from jaxlidar.survey.per_shot import ShotGeometry, SurveyContext, shot_geometry
@@ -104,13 +105,13 @@ def _windowed(scene: Scene, window: Int[Array, "2"], shape: tuple[int, int]) -> 
     """Return the scene with a part of its voxel map: what no beam of the chunk meets is left out."""
     assert scene.canopy is not None
     voxels = scene.canopy.voxels
-    nz = voxels.shape[2]
+    nz, corner = voxels.shape[2], jnp.append(window, 0)
 
     def cut(a: Array | None) -> Array | None:
-        return None if a is None else lax.dynamic_slice(a, (window[0], window[1], 0), (*shape, nz))
+        return None if a is None else lax.dynamic_slice(a, corner, (*shape, nz))
 
     # The window stays where it lies in the scene, so that shots keep their coordinates.
-    origin = jnp.asarray(voxels.origin) + voxels.voxel_size * jnp.append(window, 0)
+    origin = jnp.asarray(voxels.origin) + voxels.voxel_size * corner
     return eqx.tree_at(
         lambda s: (s.canopy.voxels.leaf, s.canopy.voxels.bark, s.canopy.voxels.origin),
         scene,
@@ -230,7 +231,8 @@ class SurveyModel:
         largest = _CHUNK_HIGHER_ORDERS if plan.orders > 1 else _CHUNK_FIRST_ORDER
         n_chunks = -(-len(survey) // min(largest, max(1, len(survey) // 8)))
         self.chunks = _chunks_of_neighbours(survey, n_chunks)
-        windows, window_shape = _windows(survey, scene, plan, self.chunks)
+        scenes = [case_scene for _, case_scene in corner_cases(middle, scene, self.unknowns)]
+        windows, window_shape = _windows(survey, scenes, plan, self.chunks)
         setters = tuple(u.setter for u in unknowns)
         self.inputs = SurveyInputs(middle, scene, key, plan, setters, window_shape)
         # A chunk that is not full has copies of its last shot, with weights of zero.
@@ -361,19 +363,38 @@ def _chunks_of_neighbours(survey: Survey, n_chunks: int) -> list[Int[np.ndarray,
 
 
 def _windows(
-    survey: Survey, scene: Scene, plan: Plan, chunks: Sequence[np.ndarray]
+    survey: Survey, scenes: Sequence[Scene], plan: Plan, chunks: Sequence[np.ndarray]
 ) -> tuple[Int[np.ndarray, "chunks 2"], tuple[int, int] | None]:
     """Return the first voxel of each chunk's window, and the shape of windows, along x and y.
 
     The shape is None where chunks have the complete map: where light of higher orders goes anywhere, and
     where windows save little.
+
+    `scenes`: with the unknowns at their start and at their bounds, which may move the map.
     """
     none = np.zeros((len(chunks), 2), int), None
-    canopy = scene.canopy
+    canopy = scenes[0].canopy
     if canopy is None or plan.orders > 1 or survey.has_sensor_position or canopy.sides != "open":
         return none
-    voxels = canopy.voxels
-    shape = np.array(voxels.shape[:2])
+    shape = np.array(canopy.voxels.shape[:2])
+    ranges = [_voxels_of_beams(survey, scene.canopy.voxels) for scene in scenes if scene.canopy is not None]
+    low, high = np.min([low for low, _ in ranges], axis=0), np.max([high for _, high in ranges], axis=0)
+    # One shape for all windows, that of the largest: chunks share a compiled program.
+    first = np.array([low[chunk].min(axis=0) for chunk in chunks])
+    last = np.array([high[chunk].max(axis=0) for chunk in chunks])
+    first, last = np.clip(first, 0, shape - 1), np.clip(last, 1, shape)
+    window_shape = np.minimum(np.max(last - first, axis=0), shape)
+    # Cutting costs a copy of the window in each product.
+    if np.prod(window_shape) > 0.5 * np.prod(shape):
+        return none
+    # A window at the rim is moved inward, so that it has its full size.
+    return np.clip(first, 0, shape - window_shape), (int(window_shape[0]), int(window_shape[1]))
+
+
+def _voxels_of_beams(
+    survey: Survey, voxels: VoxelMap
+) -> tuple[Int[np.ndarray, "shots 2"], Int[np.ndarray, "shots 2"]]:
+    """Return the first voxel that each beam may meet along x and y, and the first one after the last."""
     origin, size = np.asarray(voxels.origin, float), np.asarray(voxels.voxel_size, float)
     heights = np.array([origin[2], origin[2] + size[2] * voxels.shape[2]])
     # Beam axes at the bottom and at the top of the map, and the radius of beams there.
@@ -386,13 +407,4 @@ def _windows(
     # Another voxel on either side: rounding may put a ray on a face.
     low = np.floor((axes.min(axis=1) - radius[:, None] - origin[:2]) / size[:2]).astype(int) - 1
     high = np.floor((axes.max(axis=1) + radius[:, None] - origin[:2]) / size[:2]).astype(int) + 2
-    # One shape for all windows, that of the largest: chunks share a compiled program.
-    first = np.array([low[chunk].min(axis=0) for chunk in chunks])
-    last = np.array([high[chunk].max(axis=0) for chunk in chunks])
-    first, last = np.clip(first, 0, shape - 1), np.clip(last, 1, shape)
-    window_shape = np.minimum(np.max(last - first, axis=0), shape)
-    # Cutting costs a copy of the window in each product.
-    if np.prod(window_shape) > 0.5 * np.prod(shape):
-        return none
-    # A window at the rim is moved inward, so that it has its full size.
-    return np.clip(first, 0, shape - window_shape), (int(window_shape[0]), int(window_shape[1]))
+    return low, high

@@ -3,6 +3,7 @@
 import dataclasses
 from types import SimpleNamespace
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -17,7 +18,7 @@ from inversion.fit.unknowns import bind_unknowns, flat_start
 from inversion.scene import retrieval
 from inversion.scene.map_priors import MapPriors
 from inversion.scene.retrieval import _shot_groups, no_longer_falls
-from inversion.scene.survey_model import SurveyModel
+from inversion.scene.survey_model import SurveyModel, _waveforms
 
 LIDAR = jl.Lidar(wavelength=1064.0, altitude=1000.0, divergence=4.0, pulse=jl.GaussianPulse(4.0))
 # G of spherical leaf angles.
@@ -202,6 +203,27 @@ def test_chunks_have_windows_and_give_the_waveforms_of_the_complete_map(model):
     np.testing.assert_allclose(with_windows.gradient, complete.gradient, rtol=1e-3, atol=1e-3)
     # Records of other shots differ by far more than the tolerance.
     assert np.ptp(complete.records, axis=0).max() > 1e-4
+
+
+@pytest.mark.parametrize("precision", ["float64"], indirect=True)
+def test_windows_hold_what_beams_meet_wherever_unknowns_move_the_map(precision):
+    """An even map that moves by up to 6 m under narrow shots within it: records do not change."""
+    survey = jl.Survey(jl.Lidar(divergence=1.0), [(-10.0, -10.0), (-10.0, 10.0), (10.0, -10.0), (10.0, 10.0)])
+
+    def moved(scene, x):
+        origin = jnp.stack([x - 20.0, jnp.full_like(x, -20.0), jnp.zeros_like(x)])
+        return eqx.tree_at(lambda s: s.canopy.voxels.origin, scene, origin)
+
+    unknown = inversion.Unknown(apply=moved, name="x", bounds=(-6.0, 6.0), start=0.0)
+    scene = moved(stand(np.ones((40, 40, 1))), jnp.zeros(()))
+    bound, time = bind_unknowns([unknown], scene, of_maps=True), np.arange(-20.0, 10.0)
+    plan = plan_for_bounds(survey, scene, bound, time, n_photons=8, n_rays=8, max_orders=1)
+    groups, zero = _shot_groups(None, None, np.arange(4), 4, bound), np.zeros((4, 1, time.size))
+    model = SurveyModel(survey, scene, plan, bound, groups, zero, zero + 1.0, jax.random.key(3))
+    assert model.inputs.window_shape is not None
+    records = eqx.filter_jit(_waveforms)
+    at_start, at_end = (records(model.inputs, (jnp.asarray(x),), model.shots[0]) for x in (0.0, 5.5))
+    np.testing.assert_allclose(at_end, at_start, atol=1e-9)
 
 
 def test_gradients_are_those_of_finite_differences(model):
