@@ -32,7 +32,7 @@ from jaxlidar.trace.device_scene import DeviceScene, build_device_scene
 from jaxlidar.trace.first.first_order import FirstOrder, first_order
 from jaxlidar.trace.first.footprint import ALL_RAYS, RaySlice, fibonacci_disc, product_rule
 from jaxlidar.trace.first.mirror_return import mirror_rays
-from jaxlidar.trace.march.empty_voxels import add_tangents_of_empty_voxels
+from jaxlidar.trace.march.thin_voxels import add_tangents_of_thin_voxels
 from jaxlidar.trace.photons.higher_orders import (
     HigherOrderTally,
     PhotonBatch,
@@ -210,7 +210,7 @@ def trace_higher(scene: DeviceScene, key: PRNGKeyArray) -> HigherOrderTally:
         # The same key as for the footprint: photons leave out the random words with which that is shifted.
         words = random_words(key, PhotonBatch.n_words(scene))
         tally = with_replay(
-            trace_photons, pull_back_higher_orders, scene, words, add_tangents=add_tangents_of_empty_voxels
+            trace_photons, pull_back_higher_orders, scene, words, add_tangents=add_tangents_of_thin_voxels
         )
         if scene.optics is None:
             return jax.tree.map(lambda a: a[None], tally)

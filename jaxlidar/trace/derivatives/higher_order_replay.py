@@ -20,8 +20,8 @@ A flight has several ends. Each counts with its own deposit, and the selected on
 A group of photons is traced at a time, the smaller the more orders there are, so that memory is bounded.
 Path replay backpropagation (Vicini, Speierer and Jakob 2021, ACM Trans. Graph. 40, 108) keeps no flights. It
 traces photons twice more, and finds what comes after a flight as a difference, whose rounding would remain
-where a photon ends. Photons never collide where extinction is zero: what would be scattered there is added by
-`trace.march.empty_voxels`.
+where a photon ends. Photons hardly ever collide where extinction is zero or small: what is scattered there is
+added by `trace.march.thin_voxels`, and collisions there do not count.
 """
 
 from typing import NamedTuple
@@ -38,7 +38,7 @@ from jaxlidar.planning.config import Scatterer
 from jaxlidar.trace.deposit import take_rows
 from jaxlidar.trace.derivatives.replay import ExtinctionTables
 from jaxlidar.trace.device_scene import DeviceScene
-from jaxlidar.trace.march.empty_voxels import EmptyVoxels, start_unplaced
+from jaxlidar.trace.march.thin_voxels import ThinVoxels, start_unplaced
 from jaxlidar.trace.march.voxel_traversal import (
     Medium,
     VoxelRay,
@@ -79,7 +79,7 @@ class KeptFlights(NamedTuple):
     - `cell`, `material`: voxel and material that each end collides with; the material is -1 if there is none,
       or if it is that of a surface. `end_x`: position of each end.
     - `deposits`: deposit of each end, times the cotangents of returns.
-    - `placed`: empty voxel that each end or the photon before was placed in (`trace.march.empty_voxels`).
+    - `placed`: thin voxel that each end or the photon before was placed in (`trace.march.thin_voxels`).
     """
 
     number: Int[Array, "*chunks photons"]
@@ -128,7 +128,7 @@ def pull_back_higher_orders(
 
     1. Trace them again, and keep their flights with the deposits, times their cotangents.
     2. From the last chunk of flights to the first, add to the voxels.
-    3. If there are empty voxels, trace them once more, and add the deposits of those that are placed there.
+    3. If there are thin voxels, trace them once more, and add the deposits of those that are placed there.
     """
     medium, bins = scene.medium, scene.bins
     assert medium is not None
@@ -138,10 +138,10 @@ def pull_back_higher_orders(
     padded = jax.ShapeDtypeStruct(empty.weights.shape, empty.weights.dtype)
     # Trimming is linear: its transpose is applied once, to the cotangents.
     (of_returns,) = jax.linear_transpose(bins.trim, padded)((cotangent.weights, cotangent.outside))
-    empty_voxels = EmptyVoxels.of(scene)
+    thin_voxels = ThinVoxels.of(scene)
 
     def trace_group(number: Int[Array, ""], total: ExtinctionTables) -> ExtinctionTables:
-        # Photons of all groups are traced once as they are, and once more to be placed in empty voxels.
+        # Photons of all groups are traced once as they are, and once more to be placed in thin voxels.
         is_placing = number >= batch.n_groups
         group = jnp.where(is_placing, number - batch.n_groups, number).astype(jnp.uint32)
         first_lane = batch.first_lane(group)
@@ -149,7 +149,7 @@ def pull_back_higher_orders(
         def trace_chunk(in_chunk: Lanes, state: tuple[Array, KeptFlights], draws: PhotonDraws, order: Array):
             n_chunks, flights = state
             p = in_chunk.photons
-            flown, ends, placed, onward = empty_voxels.trace_chunk(batch, in_chunk, draws, order, is_placing)
+            flown, ends, placed, onward = thin_voxels.trace_chunk(batch, in_chunk, draws, order, is_placing)
             in_voxel = ends.flights.collided & (ends.collision.surface < 0)
             chunk_flights = KeptFlights(
                 # Dead photons fill up chunks; the first of the group stands in for them (`compact`), whose
@@ -163,7 +163,7 @@ def pull_back_higher_orders(
                 cell=ends.flights.cell,
                 material=jnp.where(in_voxel, ends.collision.material, -1),
                 end_x=ends.x,
-                deposits=_deposits(empty_voxels.scene, flown, ends, of_returns, order),
+                deposits=_deposits(thin_voxels.scene, flown, ends, of_returns, order),
                 placed=placed,
             )
             return onward, (n_chunks + 1, flights.with_chunk(n_chunks, chunk_flights))
@@ -172,7 +172,7 @@ def pull_back_higher_orders(
         lanes = start_unplaced(batch.send(group))
         _, (n_chunks, group_flights) = batch.trace_orders(lanes, nothing, trace_chunk)
         n_chunks = largest_count(n_chunks)
-        # Nothing else counts of photons that are placed in empty voxels.
+        # Nothing else counts of photons that are placed in thin voxels.
         n_chunks, n_placed = jnp.where(is_placing, 0, n_chunks), jnp.where(is_placing, n_chunks, 0)
 
         def add_chunk(n: Array, state: tuple[ExtinctionTables, Array]) -> tuple[ExtinctionTables, Array]:
@@ -191,13 +191,13 @@ def pull_back_higher_orders(
 
         def add_placed(n: Array, tables: ExtinctionTables) -> ExtinctionTables:
             flights = group_flights.chunk(n)
-            return empty_voxels.add_to_tables(tables, flights.placed, flights.deposits)
+            return thin_voxels.add_to_tables(tables, flights.placed, flights.deposits)
 
         later = jnp.zeros((batch.group_size,), of_returns.dtype)
         total = lax.fori_loop(0, n_chunks, add_chunk, (total, later))[0]
         return lax.fori_loop(0, n_placed, add_placed, total)
 
-    n_groups = jnp.where(any_problem(empty_voxels.are_empty), 2 * batch.n_groups, batch.n_groups)
+    n_groups = jnp.where(any_problem(thin_voxels.are_thin), 2 * batch.n_groups, batch.n_groups)
     zero = jax.tree.map(jnp.zeros_like, ExtinctionTables.of(scene))
     return lax.fori_loop(0, n_groups, trace_group, zero)
 
@@ -319,13 +319,16 @@ def _subtract_flights(
 def _add_collisions(
     scene: DeviceScene, medium: Medium, tables: ExtinctionTables, flights: KeptFlights, amounts: Scalar
 ) -> ExtinctionTables:
-    """Add amounts over the extinction of the material that was hit, in the voxels of collisions."""
+    """Add amounts over the extinction of the material that was hit, in the voxels of collisions.
+
+    Not in thin voxels: see `trace.march.thin_voxels`.
+    """
 
     def over_extinction(table: Array | None, scatterer: Scatterer | None) -> Scalar | None:
         if table is None or scatterer is None:
             return None
         k = table.at[flights.cell].get(mode="promise_in_bounds")
-        counts = (flights.material == scatterer.material) & (k > 0.0)
+        counts = (flights.material == scatterer.material) & ~medium.is_thin(k)
         return jnp.where(counts, amounts / jnp.where(counts, k, 1.0), 0.0)
 
     of_leaf = over_extinction(medium.leaf, scene.config.leaf)

@@ -218,8 +218,11 @@ def with_replay(
             def of_varying(values: list[Array]) -> Traced:
                 scene, numbers = scene_and_numbers(_replaced(leaves, varying, values), "forward")
                 if has_tables:
+                    assert scene.medium is not None
+                    # Collisions in thin voxels are those of `add_tangents`.
+                    medium = dataclasses.replace(scene.medium, thin_collide=add_tangents is None)
                     # Leaves in empty voxels around the box of occupied ones would attenuate, too.
-                    scene = dataclasses.replace(scene, occupied_box=None)
+                    scene = dataclasses.replace(scene, medium=medium, occupied_box=None)
                 return trace(scene, numbers)
 
             pushed = jax.jvp(of_varying, ([leaves[i] for i in varying],), (tangents,))[1]

@@ -37,6 +37,10 @@ MAX_PADDED_VOXELS = 1 << 17
 # Steps between two checks for rays that still move.
 STEPS_PER_CHECK = 8
 
+# A voxel is thin if the map would have less than this optical depth, straight down, with its extinction
+# throughout. Along a flight, the collisions that derivatives place (`trace.march.thin_voxels`) are then more
+# than those of photons.
+_THIN = 0.2
 # First voxel, and one past the last, along each axis.
 VoxelBox = tuple[tuple[Int[Array, ""], ...], tuple[Int[Array, ""], ...]]
 
@@ -74,6 +78,7 @@ class Medium(eqx.Module):
     - `angle_tables`, `leaf_angles`: of leaves that are not spherically oriented, else None.
     - `leaf_phase`, `bark_phase`: phase functions that take the place of facets, else None.
     - `periodic`: True if the map repeats along x and y.
+    - `thin_collide`: False where collisions in thin voxels have no derivative by extinction. Default True.
     """
 
     leaf: Float[Array, "cells"] | None
@@ -88,17 +93,28 @@ class Medium(eqx.Module):
     counts: Int[Array, "3"]
     shape: tuple[int, int, int] = eqx.field(static=True)
     periodic: bool = eqx.field(static=True)
+    thin_collide: bool = eqx.field(static=True, default=True)
 
-    def leaf_extinction(self, cell: Int[Array, "*s"], w: Vec) -> Scalar:
+    def is_thin(self, k: Scalar) -> Bool[Array, "*s"]:
+        """Return True for voxels of the extinction `k`, 1/m, where few photons collide, or none."""
+        return k * (self.size[2] * self.counts[2]) < _THIN
+
+    def leaf_extinction(self, cell: Int[Array, "*s"], w: Vec, *, of_collision: bool = False) -> Scalar:
         """Extinction coefficient of leaf for light along `w`, 1/m: 2 G(w) times that at G = 1/2."""
         assert self.leaf is not None
         k = _gather(self.leaf, cell)
+        if of_collision:
+            k = self._of_collision(k)
         return k if self.angle_tables is None else k * (2.0 * self.angle_tables.projection_at(w))
 
-    def bark_extinction(self, cell: Int[Array, "*s"]) -> Scalar:
+    def bark_extinction(self, cell: Int[Array, "*s"], *, of_collision: bool = False) -> Scalar:
         """Extinction coefficient of bark, 1/m."""
         assert self.bark is not None
-        return _gather(self.bark, cell)
+        k = _gather(self.bark, cell)
+        return self._of_collision(k) if of_collision else k
+
+    def _of_collision(self, k: Scalar) -> Scalar:
+        return k if self.thin_collide else jnp.where(self.is_thin(k), lax.stop_gradient(k), k)
 
     def extinction(self, cell: Int[Array, "*s"], w: Vec) -> Scalar:
         """Extinction coefficient of leaf and bark together, 1/m."""

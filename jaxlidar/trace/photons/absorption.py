@@ -100,7 +100,7 @@ def _trace_chunk(
     energy = scene.config.photons_per_batch * p.weight * jnp.max(p.optical_weights, axis=-1)
     survival = jnp.minimum(energy / _ROULETTE_ENERGY, 1.0)
     # No derivatives are taken, which these numbers are for elsewhere.
-    is_alive = p.alive & (batch.lattices_of_empty_voxels(chunk.lane, order)[0] < survival)
+    is_alive = p.alive & (batch.lattices_of_thin_voxels(chunk.lane, order)[0] < survival)
     p = dataclasses.replace(p, weight=p.weight / jnp.where(is_alive, survival, 1.0), alive=is_alive)
     return Lanes(_mix(chunk.lane), p), (tally, down)
 

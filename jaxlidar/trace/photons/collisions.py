@@ -161,13 +161,15 @@ def _in_medium(
     leaf, bark = scene.config.leaf, scene.config.bark
     if bark is None:
         assert leaf is not None
-        return _on_leaf(scene, medium, leaf, w, medium.leaf_extinction(cell, w), draws.choice, draws)
+        return _on_leaf(
+            scene, medium, leaf, w, medium.leaf_extinction(cell, w, of_collision=True), draws.choice, draws
+        )
     # Leaf and bark collide independently: the probability of each is its part of the extinction.
-    bark_k = medium.bark_extinction(cell)
+    bark_k = medium.bark_extinction(cell, of_collision=True)
     on_bark = _on_bark(scene, medium, bark, w, bark_k, draws)
     if leaf is None:
         return on_bark
-    leaf_k = medium.leaf_extinction(cell, w)
+    leaf_k = medium.leaf_extinction(cell, w, of_collision=True)
     p = leaf_k / jnp.maximum(leaf_k + bark_k, 1e-30)
     # Rescaled to (0, 1), the number that chose leaf also chooses between reflection and transmission.
     choice = draws.choice / jnp.maximum(p, 1e-30)

@@ -26,7 +26,7 @@ derivative is the derivative of the expected value. Flights that land on a surfa
 landing points move with voxel columns and terrain cells, and their directions with these
 (`trace.derivatives.reparametrisation`, with a list of the borders that matter). Photons never collide where
 the extinction coefficient is exactly zero. Derivatives get what would scatter from there by
-`trace.march.empty_voxels`.
+`trace.march.thin_voxels`.
 """
 
 import dataclasses
@@ -88,9 +88,9 @@ PHOTONS_PER_CHUNK = 256
 # Chunks that are traced together, order by order. Each group has its own sum: single precision loses small
 # deposits on a large sum.
 CHUNKS_PER_GROUP = 32
-# Random numbers of each order for derivatives: whether to place the photon in an empty voxel, and where on
-# its flight (`trace.march.empty_voxels`).
-DRAWS_IN_EMPTY_VOXELS = 2
+# Random numbers of each order for derivatives: whether to place the photon in a thin voxel, and where on
+# its flight (`trace.march.thin_voxels`).
+DRAWS_IN_THIN_VOXELS = 2
 
 
 class HigherOrderTally(eqx.Module):
@@ -131,13 +131,13 @@ class HigherOrderTally(eqx.Module):
 class Lanes(NamedTuple):
     """Photons, and the number of each in its batch, which its random numbers depend on.
 
-    - `empty_voxel`: the voxel of zero extinction where the photon was scattered, or -1, as `Placed` of
-      `trace.march.empty_voxels`; None outside of derivatives.
+    - `thin_voxel`: the thin voxel where the photon was placed, or -1, as `Placed` of
+      `trace.march.thin_voxels`; None outside of derivatives.
     """
 
     lane: UInt32[Array, "*photons"]
     photons: Photons
-    empty_voxel: Int[Array, "*photons"] | None = None
+    thin_voxel: Int[Array, "*photons"] | None = None
 
 
 # Traces the photons of a chunk through one order, and adds to sums; its arguments are these two, the photons'
@@ -170,7 +170,7 @@ class PhotonBatch:
         _, shift, words, more_words = jnp.split(words, np.cumsum([2, 2, 2 * orders * dimensions]))
         self.footprint_shift = to_unit(shift)
         self.lattices = shifted_lattices(words, orders, dimensions)
-        self.lattices_of_empty_voxels = shifted_lattices(more_words, orders, DRAWS_IN_EMPTY_VOXELS)
+        self.lattices_of_thin_voxels = shifted_lattices(more_words, orders, DRAWS_IN_THIN_VOXELS)
         self.chunk_size = min(PHOTONS_PER_CHUNK, n_photons)
         n_chunks = -(-n_photons // self.chunk_size)
         # Groups are made equally large, so that the last one is not mostly padding.
@@ -181,7 +181,7 @@ class PhotonBatch:
     @staticmethod
     def n_words(scene: DeviceScene) -> int:
         """Return the number of random words that a batch takes."""
-        dimensions = PhotonDraws.dimensions(scene.n_plates) + DRAWS_IN_EMPTY_VOXELS
+        dimensions = PhotonDraws.dimensions(scene.n_plates) + DRAWS_IN_THIN_VOXELS
         return 4 + 2 * scene.config.order_steps * dimensions
 
     def first_lane(self, group: UInt32[Array, ""]) -> UInt32[Array, ""]:

@@ -1,24 +1,26 @@
-r"""Voxels of zero extinction in derivatives of orders two and above: what leaf or bark there would scatter.
+r"""Thin voxels in derivatives of orders two and above: what leaf or bark there scatters, or would scatter.
 
 The derivative of a collision with respect to the extinction k of its voxel is the deposits from there on,
-over k (`trace.derivatives.higher_order_replay`). Where k is zero, photons never collide. There, collisions
-are placed on flights. With L the length of a flight within the voxels, and D(s) the deposits from a collision
-at s on,
+over k (`trace.derivatives.higher_order_replay`). Where k is zero, photons never collide. Where it is small,
+hardly one of them does, and counts for much: its derivative would be missing from nearly every sample, whose
+scatter would not tell. So in thin voxels (`Medium.is_thin`) collisions are placed on flights; those of the
+flights themselves do not count. With L the length of a flight within the voxels, and D(s) the deposits from a
+collision at s on,
 
-    dR/dk = sum over orders of E[ integral_0^L 1(x(s) lies in an empty voxel) D(s) ds ].
+    dR/dk = sum over orders of E[ integral_0^L 1(x(s) lies in a thin voxel) D(s) ds ].
 
 The transmittance up to s needs no factor: a flight reaches s with exactly that probability. This is the term
 of in-scattering of the differential transfer equation (Nimier-David, Mueller, Keller and Jakob 2022, ACM
 Trans. Graph. 41, 44). The integral is L times the integrand at a uniform point; a photon ends where that does
-not lie in an empty voxel. For leaves that are not spherically oriented, k is multiplied by 2 G.
+not lie in a thin voxel. For leaves that are not spherically oriented, k is multiplied by 2 G.
 
 Photons are traced once more for this. Each is placed at one of its orders n = 1, 2, ...: with the probability
 P = 1 / (n + 1) if it was not before, and P = 1 at the last one. Its weight is divided by P, or by 1 - P if it
 goes on without. So a photon that is placed at order n has the weight n (n + 1): weights grow polynomially
 with n, not geometrically. From there on it deposits as any photon does.
 
-A voxel may be empty of leaf, of bark, or of both. `EmptyVoxels` lays out a second map behind the first one.
-Its extinction is 1 where that of the first one is 0, and 0 elsewhere: a collision there chooses the material.
+A voxel may be thin for leaf, for bark, or for both. `ThinVoxels` lays out a second map behind the first one.
+Its extinction is 1 where the first one is thin, and 0 elsewhere: a collision there chooses the material.
 """
 
 import dataclasses
@@ -53,41 +55,41 @@ from jaxlidar.trace.photons.higher_orders import (
 from jaxlidar.trace.photons.photons import attached_ratio
 from jaxlidar.trace.photons.random_numbers import PhotonDraws
 
-# Empty voxels in which ends of flights were placed, or their photons at an earlier order: the index of the
+# Thin voxels in which ends of flights were placed, or their photons at an earlier order: the index of the
 # cell for leaf, that plus the number of cells for bark, or -1 for none.
 Placed = Int[Array, "ends photons"]
 
 
-class EmptyVoxels(NamedTuple):
-    """The voxels of zero extinction of a scene, for photons that are placed there.
+class ThinVoxels(NamedTuple):
+    """The thin voxels of a scene, for photons that are placed there.
 
     - `scene`: the scene, with a second map behind its own (see the module). `n_cells`: size of the first map.
-    - `are_empty`: for leaf in all cells, then for bark, True where the extinction of this material is zero;
-      False where there is no such material.
+    - `are_thin`: for leaf in all cells, then for bark, True where this material is thin; False where there is
+      no such material.
     """
 
     scene: DeviceScene
     n_cells: int
-    are_empty: Bool[Array, "two_materials_cells"]
+    are_thin: Bool[Array, "two_materials_cells"]
 
     @staticmethod
-    def of(scene: DeviceScene) -> "EmptyVoxels":
-        """Find the voxels of zero extinction of a scene."""
+    def of(scene: DeviceScene) -> "ThinVoxels":
+        """Find the thin voxels of a scene."""
         medium = scene.medium
         assert medium is not None
-        in_map = _in_map(medium)
+        in_map, is_thin_at = _in_map(medium), medium.is_thin
 
-        def find_empty(table: Array | None) -> tuple[Bool[Array, "cells"], Array | None]:
+        def find_thin(table: Array | None) -> tuple[Bool[Array, "cells"], Array | None]:
             if table is None:
                 return jnp.zeros_like(in_map), None
-            is_empty = in_map & (table == 0.0)
-            return is_empty, jnp.concatenate([table, is_empty.astype(table.dtype)])
+            is_thin = in_map & is_thin_at(table)
+            return is_thin, jnp.concatenate([table, is_thin.astype(table.dtype)])
 
-        (empty_of_leaf, leaf), (empty_of_bark, bark) = find_empty(medium.leaf), find_empty(medium.bark)
+        (thin_leaf, leaf), (thin_bark, bark) = find_thin(medium.leaf), find_thin(medium.bark)
         total = None if medium.total is None or leaf is None or bark is None else leaf + bark
         medium = dataclasses.replace(medium, leaf=leaf, bark=bark, total=total)
-        are_empty = jnp.concatenate([empty_of_leaf, empty_of_bark])
-        return EmptyVoxels(dataclasses.replace(scene, medium=medium), in_map.size, are_empty)
+        are_thin = jnp.concatenate([thin_leaf, thin_bark])
+        return ThinVoxels(dataclasses.replace(scene, medium=medium), in_map.size, are_thin)
 
     def trace_chunk(
         self,
@@ -103,18 +105,18 @@ class EmptyVoxels(NamedTuple):
         that go on.
         """
         n_cells, config, tally = self.n_cells, self.scene.config, empty_tally(self.scene)
-        assert in_chunk.empty_voxel is not None
+        assert in_chunk.thin_voxel is not None
 
         def place(flown: FlownPhotons) -> FlownPhotons:
             def place_undecided() -> tuple[Flight, Scalar]:
                 return self._place(
-                    flown, batch.lattices_of_empty_voxels(in_chunk.lane, order), order, undecided
+                    flown, batch.lattices_of_thin_voxels(in_chunk.lane, order), order, undecided
                 )
 
             flights, weight = lax.cond(is_placing, place_undecided, lambda: (flown.flights, flown.weight))
             return flown._replace(flights=flights, weight=weight)
 
-        undecided = in_chunk.photons.alive & (in_chunk.empty_voxel < 0)
+        undecided = in_chunk.photons.alive & (in_chunk.thin_voxel < 0)
         flown, _ = fly(self.scene, in_chunk.photons, tally, draws, order, place)
         ends = collide_at_ends(self.scene, flown)
         cell, is_placed = ends.flights.cell, ends.flights.collided & (ends.flights.cell >= n_cells)
@@ -122,7 +124,7 @@ class EmptyVoxels(NamedTuple):
             voxel = cell - n_cells
         else:
             voxel = jnp.where(ends.collision.material == config.bark.material, cell, cell - n_cells)
-        before = jnp.broadcast_to(in_chunk.empty_voxel, flown.weight.shape)
+        before = jnp.broadcast_to(in_chunk.thin_voxel, flown.weight.shape)
         placed = jnp.where(is_placed.reshape(before.shape), voxel.reshape(before.shape), before)
         p, _ = scatter(self.scene, flown, tally)
         return flown, ends, placed, Lanes(in_chunk.lane, p, flown.select_end(placed))
@@ -190,27 +192,27 @@ class EmptyVoxels(NamedTuple):
         return tables.add_tables(bark_cell, None, jnp.where(on_bark, values, 0.0))
 
 
-def add_tangents_of_empty_voxels(
+def add_tangents_of_thin_voxels(
     scene: DeviceScene, words: UInt32[Array, "words"], of_tables: ExtinctionTables, tangent: HigherOrderTally
 ) -> HigherOrderTally:
-    """Add to a tangent of the result of `trace_photons` what scattering in empty voxels adds.
+    """Add to a tangent of the result of `trace_photons` what scattering in thin voxels adds.
 
     Returns alone have derivatives, as in `trace.derivatives.higher_order_replay`.
 
     **Arguments:** `of_tables`: tangents of the tables of extinction; None where they are zero.
     """
-    empty_voxels, batch, tally = EmptyVoxels.of(scene), PhotonBatch(scene, words), empty_tally(scene)
-    no_tangent = jnp.zeros((empty_voxels.n_cells,), tally.weights.dtype)
+    thin_voxels, batch, tally = ThinVoxels.of(scene), PhotonBatch(scene, words), empty_tally(scene)
+    no_tangent = jnp.zeros((thin_voxels.n_cells,), tally.weights.dtype)
     of_voxels = jnp.concatenate([no_tangent if t is None else t for t in (of_tables.leaf, of_tables.bark)])
 
     def trace_chunk(in_chunk: Lanes, weights: Array, draws: PhotonDraws, order: Int[Array, ""]):
         is_placing = jnp.asarray(True)
-        flown, ends, placed, onward = empty_voxels.trace_chunk(batch, in_chunk, draws, order, is_placing)
+        flown, ends, placed, onward = thin_voxels.trace_chunk(batch, in_chunk, draws, order, is_placing)
         factor = jnp.where(placed >= 0, of_voxels[jnp.maximum(placed, 0)], 0.0)
 
         def deposit(weights: Array) -> Array:
             weight, n_entries = flown.weight.reshape(-1), tally.weights.shape[1]
-            returns = returns_of_ends(empty_voxels.scene, ends, weight, None, n_entries)
+            returns = returns_of_ends(thin_voxels.scene, ends, weight, None, n_entries)
             for row, values in returns.rows:
                 of_voxel = factor.reshape(-1, *(1,) * (values.ndim - 1))
                 weights = add_rows(weights, row, returns.first_bin, values * of_voxel)
@@ -222,7 +224,7 @@ def add_tangents_of_empty_voxels(
         lanes = start_unplaced(batch.send(group.astype(jnp.uint32)))
         return batch.trace_orders(lanes, weights, trace_chunk)[1]
 
-    is_moved = any_problem(empty_voxels.are_empty & (of_voxels != 0.0))
+    is_moved = any_problem(thin_voxels.are_thin & (of_voxels != 0.0))
     weights = tally.weights.reshape(-1, scene.bins.padded)
     weights = lax.fori_loop(0, jnp.where(is_moved, batch.n_groups, 0), trace_group, weights)
     inside, outside = scene.bins.trim(weights.reshape(tally.weights.shape))
@@ -230,8 +232,8 @@ def add_tangents_of_empty_voxels(
 
 
 def start_unplaced(lanes: Lanes) -> Lanes:
-    """Return photons that are not placed in empty voxels yet."""
-    return lanes._replace(empty_voxel=jnp.full(lanes.lane.shape, -1))
+    """Return photons that are not placed in thin voxels yet."""
+    return lanes._replace(thin_voxel=jnp.full(lanes.lane.shape, -1))
 
 
 def _in_map(medium: Medium) -> Bool[Array, "cells"]:

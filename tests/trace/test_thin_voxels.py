@@ -1,4 +1,4 @@
-"""Derivatives of the higher orders in voxels of zero extinction, against differences to a little leaf there.
+"""Derivatives of the higher orders in thin voxels, against differences to a little leaf there.
 
 Means over keys are compared by z-tests. The first order, which has no noise, is left out.
 """
@@ -12,7 +12,8 @@ import pytest
 import jaxlidar as jl
 from jaxlidar.trace.derivatives import higher_order_replay
 from jaxlidar.trace.device_scene import build_device_scene
-from jaxlidar.trace.march.empty_voxels import EmptyVoxels
+from jaxlidar.trace.march.thin_voxels import ThinVoxels
+from jaxlidar.trace.march.voxel_traversal import Medium
 from tests.helpers import agrees
 
 RANDOM = np.random.default_rng(0)
@@ -123,9 +124,44 @@ def test_gradients_are_those_of_differences(name, build, material, options, monk
     mean, expected = estimates.mean(axis=0), expected.mean(axis=0)
     assert agrees(mean, stderr, expected, sigmas=3.5)
     # Planted: attenuation alone, nothing is scattered.
-    monkeypatch.setattr(EmptyVoxels, "add_to_tables", lambda self, tables, placed, values: tables)
+    monkeypatch.setattr(ThinVoxels, "add_to_tables", lambda self, tables, placed, values: tables)
     attenuation = gradients(loss, material, voxels).mean(axis=0)
     assert not agrees(attenuation, stderr, expected, sigmas=5.0)
+
+
+def with_little_leaf(k):
+    """Return the tables of leaf and bark, with the extinction `k` of leaf where there is none."""
+    return [jnp.asarray(a, float) for a in (np.where(LEAF == 0.0, k, LEAF), BARK)]
+
+
+def test_voxels_with_next_to_no_leaf_have_the_gradient_of_empty_ones():
+    """Of the same paths, which hardly change: in all of them, photons collide too rarely to tell."""
+    loss, _ = problem(leaf_and_bark, orders=2)
+    gradient, key = jax.jit(jax.grad(loss)), jax.random.key(1)
+    empty, least, little = (gradient(*with_little_leaf(k), key)[LEAF == 0.0] for k in (0.0, 1e-9, 1e-3))
+    largest = np.max(np.abs(empty))
+    assert largest > 0.0
+    np.testing.assert_allclose(least, empty, atol=1e-4 * largest)
+    np.testing.assert_allclose(little, empty, atol=0.02 * largest)
+
+
+@pytest.mark.slow
+def test_without_thin_voxels_the_gradient_lacks_what_hardly_any_photon_meets(monkeypatch):
+    """Planted: only voxels of exactly zero extinction are thin. Forward mode is wrong alike."""
+    loss, _ = problem(leaf_and_bark, orders=2)
+    key, tables = jax.random.key(1), with_little_leaf(1e-9)
+    direction = [jnp.asarray(LEAF == 0.0, float), jnp.zeros_like(tables[1])]
+
+    def both():
+        pushed = jax.jit(lambda *a: jax.jvp(lambda *a: loss(*a, key), a, tuple(direction))[1])(*tables)
+        return float(pushed), float(jnp.sum(jax.jit(jax.grad(loss))(*tables, key) * direction[0]))
+
+    forward, reverse = both()
+    assert forward == pytest.approx(reverse, rel=2e-4)
+    monkeypatch.setattr(Medium, "is_thin", lambda self, k: k == 0.0)
+    wrong_forward, wrong_reverse = both()
+    assert wrong_forward == pytest.approx(wrong_reverse, rel=2e-4)
+    assert abs(wrong_reverse - reverse) > 0.2 * abs(reverse)
 
 
 @pytest.mark.slow
@@ -173,20 +209,20 @@ def test_forward_mode_has_the_same_term():
     assert abs(expected) > 1e-3
 
 
-def test_tables_of_empty_voxels():
+def test_tables_of_thin_voxels():
     """The second map is 1 where the first one is 0; room behind the map is not empty."""
     leaf, bark = (jnp.asarray(a, float) for a in (LEAF, BARK))
     scene, lidar = leaf_and_bark(leaf, bark), jl.Lidar()
     plan = jl.plan(lidar, scene, max_orders=2, n_rays=16, n_photons=128)
     device_scene = build_device_scene(jl.make_setup(lidar, scene, plan))
-    empty_voxels = EmptyVoxels.of(device_scene)
-    assert int(empty_voxels.are_empty.sum()) == np.sum(LEAF == 0.0) + np.sum(BARK == 0.0)
-    n = empty_voxels.n_cells
+    thin_voxels = ThinVoxels.of(device_scene)
+    assert int(thin_voxels.are_thin.sum()) == np.sum(LEAF == 0.0) + np.sum(BARK == 0.0)
+    n = thin_voxels.n_cells
     assert n > LEAF.size
-    medium, with_second = device_scene.medium, empty_voxels.scene.medium
+    medium, with_second = device_scene.medium, thin_voxels.scene.medium
     assert medium is not None
     assert with_second is not None
     np.testing.assert_array_equal(with_second.leaf[:n], medium.leaf)
-    np.testing.assert_array_equal(with_second.leaf[n:], empty_voxels.are_empty[:n])
-    np.testing.assert_array_equal(with_second.bark[n:], empty_voxels.are_empty[n:])
+    np.testing.assert_array_equal(with_second.leaf[n:], thin_voxels.are_thin[:n])
+    np.testing.assert_array_equal(with_second.bark[n:], thin_voxels.are_thin[n:])
     np.testing.assert_allclose(with_second.total, with_second.leaf + with_second.bark)
