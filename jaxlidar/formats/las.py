@@ -14,6 +14,7 @@ from jaxtyping import ArrayLike, Num
 
 from jaxlidar._fields.checks import (
     as_numpy,
+    check_kind,
     check_number,
     check_range,
     check_shape,
@@ -49,6 +50,8 @@ _SCAN_ANGLE_STEPS, _MAX_SCAN_ANGLES = (1.0, 0.006), (90.0, 180.0)
 _SECONDS_OF_WEEK = 604_800
 # Longest description of an extra dimension in a LAS file, and its name.
 _MAX_EXTRA_TEXT = 32
+# Largest number of single precision.
+_LARGEST_SINGLE = float(np.finfo(np.float32).max)
 
 
 def read_las(path: str | os.PathLike[str], *, scale: float | None = None) -> PointCloud:
@@ -66,11 +69,13 @@ def read_las(path: str | os.PathLike[str], *, scale: float | None = None) -> Poi
       that declares none.
 
     **Returns:** a `PointCloud`. Its `dropped` counts points as "noise" and "withheld". Its `crs` is the
-    system that the file declares, in metres; None with a `scale`.
+    system that the file declares, in metres; None with a `scale`. Its `extra` has the extra bytes that the
+    file names.
 
     **Raises:** FileNotFoundError where there is no such file. ImportError without laspy, or without lazrs
     for LAZ. ValueError, naming the file and the place (for points the record), where it is damaged, cut
-    short, without points, declares more than it can hold or holds coordinates that are not on Earth; and for
+    short, without points, declares more than it can hold, or extra bytes that its points lack, or holds
+    coordinates that are not on Earth; and for
     coordinates in degrees, geocentric ones, and a coordinate reference system that is not known. ValueError
     for a scale that is not positive.
 
@@ -117,6 +122,7 @@ def read_stored_points(
             if not skip_unknown_system:
                 raise
             system = CoordinateSystem()
+        dimensions = header.extra_dimensions(path, file)
         if header.laszip is None:
             file.seek(header.start)
             content = file.read(header.points * header.point_size)
@@ -135,6 +141,7 @@ def read_stored_points(
     noise = np.isin(classes, _NOISE_CLASSES)
     withheld = np.asarray(cloud.withheld).astype(bool) & ~noise
     selected = ~(noise | withheld)
+    records = np.frombuffer(content, np.uint8).reshape(len(cloud), header.point_size)
     points = PointCloud(
         position[selected],
         classes[selected],
@@ -145,6 +152,7 @@ def read_stored_points(
         scan_angle=scan_angles(cloud)[selected],
         gps_time=_gps_time(cloud, selected),
         source=np.asarray(cloud["point_source_id"]).astype(int)[selected],
+        extra={dimension.name: dimension.values(records)[selected] for dimension in dimensions},
     )
     return points, system
 
@@ -224,7 +232,8 @@ def write_las(
     - `scan_angle`: (n,) degrees from -180 to 180, rounded to 0.006. Default None: 0.
     - `point_source`: (n,) whole numbers from 0 to 65535, such as those of flight lines. Default None: 0.
     - `extra`: further numbers by name: (description, (n,) values), written in single precision as extra
-      bytes. Names and descriptions have at most 32 bytes. Default None: none.
+      bytes. Names and descriptions have at most 32 bytes, and names are none that LAS points have. Default
+      None: none.
     - `crs`: the coordinate reference system of `position`, in metres, such as "EPSG:32633". Default None: not
       known. This needs pyproj.
 
@@ -233,9 +242,9 @@ def write_las(
     **Warns:** `FileWarning` where all intensities are positive or 0 and round to 0.
 
     **Raises:** ImportError without laspy, without lazrs for LAZ, or without pyproj for `crs`. ValueError
-    for another ending, arrays of different lengths, numbers outside their range, names and descriptions
-    that are too long, and a `crs` that is not known or not in metres. OSError where the file cannot be
-    written.
+    for another ending, arrays of different lengths, numbers outside their range, inadmissible names and
+    descriptions, and a `crs` that is not known or not in metres. TypeError for an `extra` of another form.
+    OSError where the file cannot be written.
 
     **Example:**
 
@@ -333,6 +342,8 @@ class LasWriter:
         """
         if self._draft is None:
             raise ValueError(f"{self.path} is not open; admissible is with LasWriter(...) as file")
+        if extra is not None:
+            check_kind("extra", extra, Mapping, "a dict of (description, values) by name")
         if crs is not None:
             written = None if self._system is None else self._system.text
             if written is None and self._header is not None:
@@ -407,9 +418,10 @@ def las_points(
     check_range("position", position, -MAX_COORDINATE, MAX_COORDINATE)
     fields = {name: np.asarray(values) for name, values in fields.items()}
     is_format_6 = point_format >= _FORMAT_6
+    of_format = "" if is_format_6 else f" of point format {point_format} (6 to 10 hold more)"
     if "scan_angle" in fields:
         limit, step = _MAX_SCAN_ANGLES[is_format_6], _SCAN_ANGLE_STEPS[is_format_6]
-        check_range("scan_angle", fields["scan_angle"], -limit, limit)
+        check_range(f"scan_angle{of_format}", fields["scan_angle"], -limit, limit)
         name = "scan_angle" if is_format_6 else "scan_angle_rank"
         fields[name] = np.round(fields.pop("scan_angle") / step)
     for name, values in fields.items():
@@ -417,7 +429,7 @@ def las_points(
         if name not in _MAX_NUMBERS:
             check_range(name, values)
             continue
-        check_range(name, values, 0, _MAX_NUMBERS[name][is_format_6])
+        check_range(f"{name}{of_format}", values, 0, _MAX_NUMBERS[name][is_format_6])
         if np.any(values != np.floor(values)):
             raise ValueError(f"{name} has values that are not whole numbers")
     is_geographic = system is not None and system.kind == "geographic"
@@ -441,11 +453,21 @@ def las_points(
     if gps_time.min() < 0 or gps_time.max() > _SECONDS_OF_WEEK:
         header.global_encoding.gps_time_type = laspy.header.GpsTimeType.STANDARD
     extra_values = {}
-    for name, (description, values) in (extra or {}).items():
+    reserved_names = {*"xyz", *header.point_format.dimension_names, *header.point_format.dtype().names}
+    for name, entry in (extra or {}).items():
+        check_kind("name of extra", name, str, "a text")
+        field = f"extra[{name!r}]"
+        check_kind(field, entry, tuple, "a tuple (description, values)")
+        if len(entry) != 2:
+            raise TypeError(f"{field} has {len(entry)} items; admissible are two, (description, values)")
+        description, values = entry
+        check_kind(f"{field}[0]", description, str, "a text")
         if max(len(name.encode()), len(description.encode())) > _MAX_EXTRA_TEXT:
             raise ValueError(f"extra: {name!r}, {description!r}: admissible are {_MAX_EXTRA_TEXT} bytes each")
-        check_range(name, values)
-        check_shape(name, values, (len(position),))
+        if not name or "\0" in name or name in reserved_names:
+            raise ValueError(f"extra: {name!r} is empty or a name that points have; admissible is another")
+        check_range(field, values, -_LARGEST_SINGLE, _LARGEST_SINGLE)
+        check_shape(field, values, (len(position),))
         header.add_extra_dim(laspy.ExtraBytesParams(name, np.float32, description))
         extra_values[name] = np.asarray(values, np.float32)
     points = laspy.LasData(header, laspy.ScaleAwarePointRecord.zeros(len(position), header=header))

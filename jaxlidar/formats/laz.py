@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
 
 import numpy as np
+from jaxtyping import Bool
 
 from jaxlidar._fields.checks import required_for
 from jaxlidar.formats.checks import check_unpacked_size
@@ -34,7 +35,7 @@ _LAYERS = {10: 9, 11: 1, 12: 2, 13: 1}
 _EXTRA_BYTES, _EXTRA_LAYERS = 0, 14
 # Bytes that lazrs allocates for the statistics of each extra byte.
 _PER_EXTRA_BYTE = 10_000
-# The layers with the fields of a `PointCloud` come first.
+# The layers with the fields of a `PointCloud` come first; those of its extra bytes come last.
 _USED_LAYERS = 9
 # Number of the layer with GPS times.
 _TIMES_LAYER = 8
@@ -69,8 +70,9 @@ def decompress_points(
         raise ValueError(f"{path}: chunk table: damaged ({error})") from error
     sizes = _chunk_sizes(path, header, packing, entries, table - first)
     if packing.layered:
-        used = packing.layers if with_packets else _USED_LAYERS
-        _check_layers(path, file, header, packing.layers, used, sizes, first)
+        is_used = np.ones(packing.layers, bool)
+        is_used[_USED_LAYERS : packing.layers - header.extra_bytes] = with_packets
+        _check_layers(path, file, header, is_used, sizes, first)
     else:
         _check_streams(path, file, header, sizes, first)
     points = bytearray(header.points * header.point_size)
@@ -95,7 +97,7 @@ def _selection(lazrs: Any, with_packets: bool) -> Any:
     if with_packets:
         return lazrs.DecompressionSelection(lazrs.SELECTIVE_DECOMPRESS_ALL)
     names = ("XY_RETURNS_CHANNEL", "Z", "CLASSIFICATION", "FLAGS", "INTENSITY")
-    names += ("SCAN_ANGLE", "POINT_SOURCE_ID", "GPS_TIME")
+    names += ("SCAN_ANGLE", "POINT_SOURCE_ID", "GPS_TIME", "ALL_EXTRA_BYTES")
     return lazrs.DecompressionSelection(sum(getattr(lazrs, f"SELECTIVE_DECOMPRESS_{n}") for n in names))
 
 
@@ -169,12 +171,17 @@ def _chunk_sizes(
 
 
 def _check_layers(
-    path: Path, file: BinaryIO, header: LasHeader, count: int, used: int, sizes: list[int], offset: int
+    path: Path,
+    file: BinaryIO,
+    header: LasHeader,
+    is_used: Bool[np.ndarray, " layers"],
+    sizes: list[int],
+    offset: int,
 ) -> None:
-    """Refuse chunks whose layers, `count`, do not fit, or whose first `used` ones cannot be decoded."""
+    """Refuse chunks whose layers do not fit, or whose layers that are used cannot be decoded."""
     # A chunk begins with one point that is not compressed and the number of points. The sizes of the layers
     # follow.
-    lead = header.point_size + 4
+    count, lead = len(is_used), header.point_size + 4
     for i, size in enumerate(sizes):
         if size == 0:
             continue
@@ -183,7 +190,7 @@ def _check_layers(
         if lead + 4 * count + layers.sum() > size:
             raise ValueError(f"{path}: chunk {i}: its layers do not fit into its {size} bytes")
         starts = offset + lead + 4 * count + np.cumsum(layers) - layers
-        for layer in np.flatnonzero(layers[:used]):
+        for layer in np.flatnonzero(is_used & (layers > 0)):
             file.seek(starts[layer])
             if file.read(4) == _IMPOSSIBLE_START:
                 raise ValueError(f"{path}: chunk {i}: layer {layer} is damaged")

@@ -3,7 +3,7 @@
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, Num
 
 
 class PointCloud(NamedTuple):
@@ -20,6 +20,9 @@ class PointCloud(NamedTuple):
     - `source`: (n,) number of the flight line; None where it is not known. Default None.
     - `crs`: coordinate reference system of `position`, such as "EPSG:32633"; None where it is not known.
       Default None.
+    - `extra`: the extra bytes of a file by name, (n,) or (n, 2 or 3), such as the labels that
+      `DiscreteReturns.to_las` writes: in the type of the file, or where it declares a scale, an offset or a
+      number for no data, in double precision with NaN for no data. Default None: not known.
 
     **Example:**
 
@@ -41,3 +44,4 @@ class PointCloud(NamedTuple):
     gps_time: Float[np.ndarray, " n"] | None = None
     source: Int[np.ndarray, " n"] | None = None
     crs: str | None = None
+    extra: dict[str, Num[np.ndarray, "n *components"]] | None = None

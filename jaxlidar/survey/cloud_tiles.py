@@ -354,7 +354,7 @@ def _is_near(points: PointCloud, axes: list[np.ndarray]) -> Bool[np.ndarray, "nx
 @functools.lru_cache(maxsize=2)
 def _points_of(path: Path, version: tuple[int, int]) -> PointCloud:
     """Read a file. The last ones are kept: neighbouring tiles need them, too."""
-    return read_las(path)
+    return read_las(path)._replace(extra=None)
 
 
 def _points_between(

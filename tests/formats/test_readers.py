@@ -235,6 +235,59 @@ def test_points_of_a_cloud_without_noise_and_withheld_points(cloud):
     np.testing.assert_array_equal(points.intensity, [0.0, 10.0, 40.0])
 
 
+def write_with_extra_bytes(path, **changes):
+    """Write two points with extra bytes of each kind; `changes` are of what declares "code"."""
+    las = laspy.create(point_format=6, file_version="1.4")
+    parameters = {"scales": [0.01], "offsets": [5.0], "no_data": [-1]}
+    las.add_extra_dims(
+        [
+            laspy.ExtraBytesParams("code", "u2", "a number"),
+            laspy.ExtraBytesParams("range", "i4", "in cm", **parameters),
+            laspy.ExtraBytesParams("normal", "3f4", "of the surface"),
+        ]
+    )
+    las.x, las.y, las.z = np.arange(6.0).reshape(3, 2)
+    las.code, las.normal = [7, 65535], [[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]]
+    las.points.array["range"] = [250, -1]
+    las.write(path)
+    data = bytearray(path.read_bytes())
+    record = data.index(b"code\0") - 4
+    for offset, value in changes.values():
+        data[record + offset : record + offset + len(value)] = value
+    path.write_bytes(data)
+    return path
+
+
+@pytest.mark.parametrize("suffix", [".las", ".laz"])
+def test_extra_bytes_are_read_as_declared(tmp_path, suffix):
+    if suffix == ".laz":
+        pytest.importorskip("lazrs")
+    path = write_with_extra_bytes(tmp_path / f"a{suffix}")
+    extra = read_las(path).extra
+    assert list(extra) == ["code", "range", "normal"]
+    assert extra["code"].dtype == np.uint16
+    np.testing.assert_array_equal(extra["code"], [7, 65535])
+    np.testing.assert_allclose(extra["range"], [7.5, np.nan])
+    np.testing.assert_array_equal(extra["normal"], [[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]])
+    # Bytes without a type are no number.
+    path = write_with_extra_bytes(path, untyped=(2, b"\0\2"))
+    assert list(read_las(path).extra) == ["range", "normal"]
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ((2, b"\x1f"), "'code' has type 31; admissible is .0, 30."),
+        ((2, b"\x0a"), "'normal' ends at byte 54 of point records, which have 48"),
+        ((4, b"range\0"), "two dimensions have the name 'range'"),
+    ],
+)
+def test_damaged_declarations_of_extra_bytes_are_refused(tmp_path, change, message):
+    path = write_with_extra_bytes(tmp_path / "a.las", change=change)
+    with pytest.raises(ValueError, match=f"a.las: header: extra bytes: {message}"):
+        read_las(path)
+
+
 def test_a_recorded_point_cloud(shared):
     points = read_las(shared / "voxels" / "tree_point_cloud.las")
     assert len(points.position) == 20198
@@ -299,8 +352,11 @@ def test_compressed_points_equal_uncompressed_ones(compressed, tmp_path, point_f
     path, _ = compressed(point_format, points)
     (tmp_path / "cloud.las").write_bytes(small_cloud(False, point_format, points))
     # The first five fields are arrays; the last one counts dropped points.
-    for array, expected in zip(read_las(path)[:5], read_las(tmp_path / "cloud.las")[:5]):
+    cloud, uncompressed = read_las(path), read_las(tmp_path / "cloud.las")
+    for array, expected in zip(cloud[:5], uncompressed[:5]):
         np.testing.assert_array_equal(array, expected)
+    np.testing.assert_array_equal(cloud.extra["height"], uncompressed.extra["height"])
+    assert cloud.extra["height"].any()
 
 
 @pytest.mark.parametrize("point_format", [3, 6])
