@@ -46,6 +46,7 @@ from collections.abc import Callable, Iterator, Mapping
 from typing import Any, NamedTuple, TypeAlias, final
 
 import equinox as eqx
+import jax
 import numpy as np
 from jaxtyping import Bool, Float, Int, Num, Shaped
 
@@ -313,6 +314,12 @@ class DiscreteReturns(eqx.Module):
             if crs is not None:
                 raise ValueError(f"crs = {crs!r} is given together with a LasWriter, which has its own")
             if len(self):
+                if (largest := np.max(self.reflectance)) > 1.0:
+                    raise ValueError(
+                        f"reflectance = {largest:.6g} is outside the admissible range [0, 1] of a LasWriter, "
+                        f"where one is an intensity of {_FULL_INTENSITY}: give to_las a path, which scales "
+                        "intensities to the largest, or write your own with LasWriter.write"
+                    )
                 intensity = _FULL_INTENSITY * np.maximum(self.reflectance, 0.0)
                 path.write(self.position, **self._point_fields(intensity, extra), crs=self.crs)
             return
@@ -611,6 +618,7 @@ def _find_echoes(
 
     position, amplitude = _apex(flat, peaks.index)
     full_width = _full_widths(flat, peaks, position, amplitude)
+    relative_level: float | np.ndarray = fraction
     if detector == "constant fraction":
         position = _crossing(flat, peaks.index, -1, fraction * amplitude, peaks.before)
     elif detector == "leading edge":
@@ -618,8 +626,8 @@ def _find_echoes(
         # The threshold where the record crosses it, which is about that at the first maximum.
         crossed = levels[peaks.row, (peaks.first % width) - 1 if levels.shape[1] > 1 else 0]
         position = _crossing(flat, peaks.first, -1, crossed, peaks.before, logarithmic=True)
-        fraction = crossed / first_amplitude
-    position = _calibrated(detector, position, _readings_of_pulse(detector, pulse, fraction))
+        relative_level = crossed / first_amplitude
+    position = _calibrated(detector, position, _readings_of_pulse(detector, pulse, relative_level))
     start, end = _extents(padded, peaks, noise)
     first_sample = peaks.row * width + 1
     return _Echoes(
@@ -1146,16 +1154,11 @@ def _assemble(
 ) -> DiscreteReturns:
     """Sort echoes by shot and time, drop the weakest beyond `max_returns` of a shot, and number them."""
     order = np.lexsort((echoes["time"], echoes["shot"]))
-    if max_returns is not None:
-        by_strength = np.lexsort((-echoes["amplitude"], echoes["shot"]))
-        rank = np.empty(order.size, int)
-        rank[by_strength] = _number_in_shot(echoes["shot"][by_strength])
-        order = order[rank[order] <= max_returns]
     columns = {name: values[order] for name, values in echoes.items()}
     shot, time = columns["shot"], columns["time"]
     axes, acquisition = waves.axes, waves.acquisition
     counts = np.bincount(shot, minlength=len(waves))
-    return DiscreteReturns(
+    returns = DiscreteReturns(
         **columns,
         range=waves.range_at(shot, time),
         position=position_along_beam(axes.origin[shot], axes.direction[shot], time),
@@ -1168,6 +1171,17 @@ def _assemble(
         n_shots=len(waves),
         crs=waves.crs,
     )
+    return returns if max_returns is None else strongest(returns, max_returns)
+
+
+def strongest(returns: DiscreteReturns, max_returns: int) -> DiscreteReturns:
+    """Return the `max_returns` strongest returns of each shot, numbered anew."""
+    by_strength = np.lexsort((-returns.amplitude, returns.shot))
+    rank = np.empty(len(returns), int)
+    rank[by_strength] = _number_in_shot(returns.shot[by_strength])
+    remaining = jax.tree.map(lambda column: column[rank <= max_returns], returns)
+    counts = np.minimum(remaining.n_returns, max_returns)
+    return dataclasses.replace(remaining, number=_number_in_shot(remaining.shot), n_returns=counts)
 
 
 def _number_in_shot(shot: Int[np.ndarray, " returns"]) -> Int[np.ndarray, " returns"]:

@@ -39,6 +39,7 @@ from jaxlidar.survey.returns import (
     input_of_waveform,
     input_of_waveforms,
     returns_of,
+    strongest,
     true_returns_of,
     warn_of_expected_returns,
     wavelength_index,
@@ -388,7 +389,7 @@ class Waveforms(eqx.Module):
         returns = self.returns(detector, **options)
         if "max_returns" in options or len(returns) == 0 or returns.n_returns.max() <= MAX_LAS_RETURNS:
             return returns
-        kept = self.returns(detector, **options, max_returns=MAX_LAS_RETURNS)
+        kept = strongest(returns, MAX_LAS_RETURNS)
         shots = len(np.unique(returns.shot[returns.n_returns > MAX_LAS_RETURNS]))
         warn_user(
             f"{len(returns) - len(kept)} of {len(returns)} returns are not written, the weakest of {shots} "
@@ -445,16 +446,32 @@ class Waveforms(eqx.Module):
     def to_xarray(self) -> Any:
         """The waveforms as an `xarray.Dataset` over shots, wavelengths and times, with units.
 
-        **Returns:** an `xarray.Dataset`.
+        **Returns:** an `xarray.Dataset` of the fields, and of those of `truth`. The coordinates of its shots
+        are `zenith`, `azimuth`, and of `acquisition` `gps_time`, `scan_angle`, `flight_line` and
+        `range_at_time_zero`.
 
         **Raises:** ImportError where xarray is not installed.
+
+        **Example:**
+
+        >>> import jax, jaxlidar as jl
+        >>> line = {"start": (0, 0), "end": (0, 10), "speed": 50.0, "pulse_rate": 10.0}
+        >>> survey = jl.Survey.scan(jl.Lidar(), jl.Oscillating(20.0, 1.0), **line, flight_line=7)
+        >>> many = jl.simulate_many(survey, jl.Scene(ground=jl.Ground()), key=jax.random.key(0))
+        >>> dataset = many.to_xarray()
+        >>> print(dataset.flight_line.values, dataset.scan_angle.values.round(1))
+        [7 7 7] [ 0.  11.8 19. ]
         """
         datasets = datasets_of(self)
+        dataset = datasets["/"]
+        if self.acquisition is not None:
+            variables = datasets["/acquisition"].data_vars.items()
+            dataset = dataset.assign_coords({name: a for name, a in variables if a.dims == ("shot",)})
         if self.truth is None:
-            return datasets["/"]
+            return dataset
         # Its samples are those of the waveforms; heights follow from their times.
         truth = datasets["/truth"].drop_vars(["time", "height"]).rename(sample="time")
-        return datasets["/"].merge(truth)
+        return dataset.merge(truth)
 
     def save(self, path: str | os.PathLike[str], case: Case | None = None) -> None:
         """Write the waveforms as netCDF or Zarr, which `Waveforms.open` and `jaxlidar.open` read.

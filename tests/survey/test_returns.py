@@ -321,16 +321,18 @@ def test_the_acquisition_has_the_noise_of_a_sample_without_signal():
 def test_the_strongest_returns_are_taken_where_there_are_too_many(waveforms):
     returns = waveforms.returns(max_returns=1)
     strongest = waveforms.returns()
-    assert set(returns.n_returns.tolist()) == {1}
+    assert set(returns.n_returns.tolist()) == set(returns.number.tolist()) == {1}
     np.testing.assert_allclose(returns.amplitude, strongest.amplitude.reshape(-1, 2).max(axis=1))
 
 
 def test_files_say_how_many_returns_they_have_no_room_for(tmp_path, monkeypatch, waveforms):
     monkeypatch.setattr("jaxlidar.survey.waveforms.MAX_LAS_RETURNS", 1)
-    count = len(waveforms)
+    count, reports = len(waveforms), []
     with pytest.warns(FileWarning, match=f"{count} of {2 * count} returns are not written.* {count} shots"):
-        written = waveforms.to_las(tmp_path / "one.las")
+        written = waveforms.to_las(tmp_path / "one.las", progress=reports.append)
     assert set(written.n_returns.tolist()) == {1}
+    # They are detected once.
+    assert [report.done for report in reports] == [count]
     # Asked for, they are no surprise.
     assert len(waveforms.to_las(tmp_path / "asked.las", max_returns=1)) == count
 

@@ -3,6 +3,7 @@
 import subprocess
 import sys
 
+import equinox as eqx
 import jax
 import laspy
 import numpy as np
@@ -56,7 +57,11 @@ def test_points_have_the_numbers_of_the_returns(tmp_path, waveforms, suffix):
     for name, field in (*extra.items(), ("ground share", "ground_share")):
         np.testing.assert_array_equal(cloud[name], getattr(returns, field).astype(np.float32))
     # The package's own reader and command agree.
-    np.testing.assert_allclose(jl.io.read_las(path).position, cloud.xyz, atol=1e-9)
+    own = jl.io.read_las(path)
+    np.testing.assert_allclose(own.position, cloud.xyz, atol=1e-9)
+    assert list(own.extra) == list(cloud.point_format.extra_dimension_names)
+    for name, values in own.extra.items():
+        np.testing.assert_array_equal(values, cloud[name])
 
 
 def test_seconds_of_a_week_are_flagged_as_such(tmp_path):
@@ -184,10 +189,27 @@ def test_numbers_that_point_formats_do_not_hold_are_refused(tmp_path):
         ({"scan_angle": 181.0 * value}, "scan_angle = 181 is outside"),
         ({"point_source": 70000 * value}, "point_source_id = 70000 is outside"),
         ({"extra": {"x" * 33: ("text", value)}}, "admissible are 32 bytes"),
-        ({"extra": {"a": ("text", np.ones(2))}}, r"a has shape \(2,\)"),
+        ({"extra": {"a": ("text", np.ones(2))}}, r"extra\['a'\] has shape \(2,\)"),
+        ({"extra": {"a": ("text", 1e300 * value)}}, r"extra\['a'\] = 1e\+300 is outside"),
+        ({"extra": {"": ("text", value)}}, "extra: '' is empty or a name that points have"),
+        ({"extra": {"intensity": ("text", value)}}, "extra: 'intensity' is empty or a name that points have"),
+        ({"extra": {"X": ("text", value)}}, "extra: 'X' is empty or a name that points have"),
     ):
         with pytest.raises(ValueError, match=message):
             jl.io.write_las(tmp_path / "a.las", point, **fields)
+
+
+def test_what_a_format_or_a_part_does_not_hold_names_the_way_out(tmp_path, waveforms):
+    upward = eqx.tree_at(lambda w: w.acquisition.scan_angle, waveforms, replace_fn=lambda a: a + 120.0)
+    with pytest.raises(ValueError, match=r"scan_angle of point format 4 \(6 to 10 hold more\) = 120 is"):
+        upward.to_las_waveforms(tmp_path / "a.las", point_format=4)
+    upward.to_las_waveforms(tmp_path / "a.las", point_format=9)
+    bright = eqx.tree_at(lambda r: r.reflectance, waveforms.returns(), replace_fn=lambda a: 10.0 * a)
+    with jl.io.LasWriter(tmp_path / "parts.las") as file:
+        waveforms.to_las(file)
+        with pytest.raises(ValueError, match=r"reflectance = .* is outside .* give to_las a path, which"):
+            bright.to_las(file)
+    bright.to_las(tmp_path / "whole.las")
 
 
 @pytest.mark.parametrize("suffix", [".las", ".laz"])

@@ -518,6 +518,11 @@ def test_a_dataset_has_units_and_all_waveforms():
     assert data.energy.attrs["units"] == "J"
     assert np.array_equal(data.components.sel(component="ground"), waveforms.components["ground"])
     assert np.array_equal(data.energy_budget.sel(fate="escaped"), waveforms.energy_budget["escaped"])
+    acquisition = waveforms.acquisition
+    for name in ("gps_time", "scan_angle", "flight_line", "range_at_time_zero"):
+        assert data[name].dims == ("shot",)
+        assert np.array_equal(data.coords[name], getattr(acquisition, name), equal_nan=True)
+    assert data.gps_time.attrs["units"] == "s"
     wave = waveforms[-1]
     assert isinstance(wave, jl.Waveform)
     assert np.array_equal(wave.reflectance, waveforms.reflectance[15])
