@@ -10,9 +10,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from jaxlidar._fields.checks import check_number, check_numbers, check_shape
+from jaxlidar._fields.checks import check_number, check_numbers, check_shape, warn_user
 from jaxlidar._fields.crs import CoordinateSystem, system_of_crs, system_of_name, units_agree
-from jaxlidar.formats.checks import MAX_COORDINATE, check_unpacked_size, existing_file
+from jaxlidar.formats.checks import MAX_COORDINATE, FileWarning, check_unpacked_size, existing_file
 from jaxlidar.formats.coordinates import MAX_ELEVATION, MIN_ELEVATION, open_raster
 from jaxlidar.formats.text import parse_integer, parse_number, read_lines
 from jaxlidar.formats.units import unit_length
@@ -29,6 +29,8 @@ _TIFF = (".tif", ".tiff")
 _NO_DATA, _LARGEST_SINGLE = (-9999.0, -32768.0, -32767.0, -99999.0), 3.4e38
 # The unit of heights in a .prj file of ArcInfo's old form; "NO" for none.
 _HEIGHT_UNIT = re.compile(r"^\s*zunits\s+(\S+)", re.IGNORECASE | re.MULTILINE)
+# Bounds may lie beyond the cells of a file by this fraction of a cell.
+_ROUNDING_OF_BOUNDS = 1e-3
 # Admissible cell sizes, m.
 _MIN_CELL_SIZE = 1e-3
 # Grids of unknown units are in degrees if their cells are smaller than this, m, or their mean slope is
@@ -76,7 +78,8 @@ def read_dem(
 
     - `path`: the file. A GeoTIFF's first band is read. The coordinate reference system of an ASCII grid lies
       in a .prj file beside it. For both the packages `rasterio` and `pyproj` are needed, of the extra `io`.
-    - `bounds`: (west, south, east, north) in m: only nodes within are read. Default None: all.
+    - `bounds`: (west, south, east, north) in m: only nodes within are read, and the terrain ends where the
+      file does. Default None: all.
     - `fill`: height, m, of nodes without data. Default None: such nodes are refused. They are those that the
       file declares, NaN, and numbers that stand for no data by custom: -9999, -99999, -32767, -32768 and the
       largest ones of single precision.
@@ -86,6 +89,8 @@ def read_dem(
     - `law`: of the `Terrain`. Default `Lambertian()`.
 
     **Returns:** a `DemRead`.
+
+    **Warns:** `FileWarning` for `bounds` beyond the cells of the file.
 
     **Raises:** FileNotFoundError where there is no such file; ImportError without `rasterio` where that is
     needed, or without `pyproj` where there is a coordinate reference system. ValueError, naming the file and
@@ -273,6 +278,18 @@ def _within(
                 "needed"
             )
         slices.append(slice(int(inside[0]), int(inside[-1]) + 1))
+    # Nodes are centres of cells. Bounds that are those of the file may be rounded.
+    low, high = origin - 0.5 * spacing, origin + spacing * (np.array(shape) - 0.5)
+    margin, limits = _ROUNDING_OF_BOUNDS * spacing, np.array(bounds, float)
+    # Infinite ones ask for all that there is.
+    is_beyond = np.r_[limits[:2] < low - margin, limits[2:] > high + margin] & np.isfinite(limits)
+    if np.any(is_beyond):
+        (west, south), (east, north) = low.tolist(), high.tolist()
+        warn_user(
+            f"{path}: bounds = {tuple(map(float, bounds))} reach beyond the file, from ({west:.9g}, "
+            f"{south:.9g}) to ({east:.9g}, {north:.9g}) m: the terrain ends there",
+            FileWarning,
+        )
     return slices[0], slices[1]
 
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from jaxlidar.io import read_dem
+from jaxlidar.io import FileWarning, read_dem
 
 # Rows of a file run from north to south.
 ROWS = np.array([[1.0, 2.0, 3.0], [4.0, 5.0, 6.5]])
@@ -58,6 +58,17 @@ def test_only_nodes_within_the_bounds_are_read(tmp_path, write):
     np.testing.assert_array_equal(terrain.origin, [600_015.0, 5_200_005.0])
     with pytest.raises(ValueError, match="0 nodes lie between 1 and 2 m along x"):
         read_dem(write(tmp_path), bounds=(1, 1, 2, 2))
+
+
+def test_bounds_beyond_the_cells_of_the_file_are_warned_of(tmp_path):
+    path, infinite = write_ascii_grid(tmp_path), float("inf")
+    terrain, _, _ = read_dem(path)
+    low, high = terrain.origin - 5.0, np.asarray(terrain.end) + 5.0
+    # The edges of the outermost cells are those of the file.
+    for bounds in ((*low, *high), (*low, infinite, infinite)):
+        np.testing.assert_array_equal(read_dem(path, bounds=bounds).terrain.heights, terrain.heights)
+    with pytest.warns(FileWarning, match=r"bounds = .* reach beyond the file, from \(600000, 5200000\) to "):
+        read_dem(path, bounds=(*low, high[0], high[1] + 1.0))
 
 
 def test_a_header_may_name_the_centre_of_the_first_cell(tmp_path):
