@@ -171,15 +171,31 @@ def memory_limit(max_memory: float | None) -> float:
     return 0.25 * machine_memory() if max_memory is None else max_memory * 1e9
 
 
-def check_memory(size: float, limit: float) -> None:
+def check_memory(
+    size: float, limit: float, *, first_order: float = 0.0, n_plates: int = 0, wavelengths: int = 1
+) -> None:
     """Refuse a simulation that does not fit.
+
+    **Arguments:** `size`, `limit`: bytes. `first_order`: bytes of one response of order one. `n_plates`,
+    `wavelengths`: numbers of them.
 
     **Raises:** ValueError with the numbers, and what to change.
     """
-    if size > limit:
-        raise ValueError(
-            f"the simulation would take about {format_bytes(size)} of memory; admissible is max_memory = "
-            f"{limit / 1e9:.3g} GB: follow fewer orders (max_orders=), record a shorter window (window=), "
-            f"use wider fine bins (bin_width=), have fewer plates or materials, or at most "
-            f"{MAX_APPLIED_WAVELENGTHS} wavelengths"
+    if size <= limit:
+        return
+    ways = (
+        "follow fewer orders (max_orders=), record a shorter window (window=), use wider fine bins "
+        "(bin_width=), or have fewer plates or materials"
+    )
+    if wavelengths > MAX_APPLIED_WAVELENGTHS:
+        ways += f", or at most {MAX_APPLIED_WAVELENGTHS} wavelengths"
+    # Histories of order one are kept in any case: of n plates they are C(4 n + 2, 2 n + 1).
+    if n_plates and first_order > limit:
+        ways = (
+            f"have fewer than {n_plates} plates, since order one alone takes {format_bytes(first_order)} for "
+            "their histories; many layers of leaves are the voxels of one canopy"
         )
+    raise ValueError(
+        f"the simulation would take about {format_bytes(size)} of memory; admissible is max_memory = "
+        f"{limit / 1e9:.3g} GB: {ways}"
+    )

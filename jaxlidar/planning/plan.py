@@ -533,7 +533,9 @@ def plan(
     if not keeps:
         config = dataclasses.replace(config, keeps_histories=False, degree=0)
     memory = memory_of(orders, keeps)
-    check_memory(memory, limit)
+    of_order_one = dataclasses.replace(config, order_steps=1)
+    first_order = response_bytes(of_order_one, bins, degree=0, n_traces=n_traces(keeps))
+    check_memory(memory, limit, first_order=first_order, n_plates=n_plates, wavelengths=wavelengths)
     # Fits may ask for more orders later: the scope says how many there would be memory for.
     possible_orders = range(max(order_choice.affordable_orders, orders), orders - 1, -1)
     table, on_survey = (), ()

@@ -43,6 +43,10 @@ def test_many_plates_are_refused_before_anything_is_allocated():
     lidar = jl.Lidar(wavelength=np.linspace(500.0, 1600.0, memory.MAX_APPLIED_WAVELENGTHS + 1))
     with pytest.raises(ValueError, match=r"would take about .* GB of memory; .* at most 8 wavelengths"):
         jl.plan(lidar, scene, max_orders=12, describe=False)
+    # Nothing but fewer plates helps there.
+    scene = jl.Scene(plates=plates(19), ground=GROUND)
+    with pytest.raises(ValueError, match=r"GB: have fewer than 19 plates, .* voxels of one canopy$"):
+        jl.plan(jl.Lidar(), scene, max_orders=1, describe=False)
 
 
 @pytest.mark.slow
