@@ -11,7 +11,9 @@ import numpy as np
 
 from jaxlidar.cli.shared import ResultPath
 from jaxlidar.formats.airborne import AirborneShots
+from jaxlidar.formats.coordinates import GEOGRAPHIC
 from jaxlidar.formats.dem import read_grid
+from jaxlidar.formats.footprints import quantities_of_columns, read_places
 from jaxlidar.formats.las import read_stored_points
 from jaxlidar.formats.las_header import read_header
 from jaxlidar.formats.las_waveforms import has_packets
@@ -201,8 +203,21 @@ def describe_inventory(path: Path, columns: dict[str, str], others: list[str]) -
     return "\n".join([lines[0], *sorted(lines[1:]), f"columns: {', '.join(read)}{not_read}"])
 
 
+def describe_places(path: Path, quantities: set[str]) -> str:
+    """Describe a table of the places of footprints."""
+    # Longitude and latitude stay as they are.
+    places = read_places(path, GEOGRAPHIC)
+    low, high = places.position.min(axis=0), places.position.max(axis=0)
+    spans = _spans(low, high)
+    if "x" not in quantities:
+        names = ("longitude", "latitude")
+        spans = ", ".join(f"{name} {a:.5f} to {b:.5f} degrees" for name, a, b in zip(names, low, high))
+    beams = f", beams {', '.join(np.unique(places.beam))}" if "beam" in quantities else ""
+    return f"places of {len(places.position):,} footprints: {spans}{beams}"
+
+
 def describe_csv(path: Path) -> str:
-    """Describe a table of cylinders, trees or a trajectory by the names of its columns, else a spectrum."""
+    """Describe a table of cylinders, trees, footprints or a trajectory by its columns, else a spectrum."""
     with path.open("rb") as file:
         head = file.readline(MAX_HEAD).decode("utf-8", "replace")
     if TREE_COLUMN.search(head):
@@ -211,8 +226,13 @@ def describe_csv(path: Path) -> str:
     columns: dict[str, str] = {}
     with contextlib.suppress(ValueError):
         columns, _ = columns_in_use(names)
-    if columns and not TIME_COLUMN.search(head):
+    quantities, has_time = quantities_of_columns(names), TIME_COLUMN.search(head) is not None
+    has_places = quantities >= {"x", "y"} or quantities >= {"longitude", "latitude"}
+    is_of_shots = has_places and not quantities.isdisjoint(("shot_number", "beam"))
+    if columns and not has_time and not is_of_shots:
         return describe_inventory(path, columns, [name for name in names if name not in columns.values()])
+    if is_of_shots or (has_places and not has_time):
+        return describe_places(path, quantities)
     if not TRAJECTORY_COLUMN.search(head):
         return describe_spectrum(path)
     if GEOGRAPHIC_COLUMN.search(head):
@@ -258,8 +278,8 @@ def info(file: Path) -> None:
 
     Known are cases (.toml), results (.nc, .zarr), voxels (.vox), points (.las, .laz), airborne waveforms
     (.las with .wdp, .pls with .wvs, NEON's .npz), GEDI level 1B (.h5), tree models (.qsm, .txt, .csv), meshes
-    (.obj, .ply, .stl, .gltf, .glb), elevation models (.tif, .tiff, .asc), inventories of trees, trajectories
-    and spectra (.csv).
+    (.obj, .ply, .stl, .gltf, .glb), elevation models (.tif, .tiff, .asc), inventories of trees, places of
+    footprints, trajectories and spectra (.csv).
 
     \b
     Examples:

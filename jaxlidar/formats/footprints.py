@@ -62,7 +62,8 @@ def read_places(path: str | os.PathLike[str], crs: str) -> Places:
       is), unique whole numbers up to 2^63 - 1, and beam, such as "BEAM0101", in any order and case, with
       spaces or underscores. Other columns are not read; a `UserWarning` names those that nearly have the name
       of one that is missing.
-    - `crs`: coordinate reference system of x and y, in metres.
+    - `crs`: coordinate reference system of x and y, in metres; or `GEOGRAPHIC`, in which longitudes and
+      latitudes stay as they are.
 
     **Returns:** a `Places`. Without shot numbers, rows are numbered from 1; without beams, all are of
     "BEAM0101". Shots of products that have no place are skipped.
@@ -112,10 +113,21 @@ def read_places(path: str | os.PathLike[str], crs: str) -> Places:
     return Places(position, shot_numbers, np.array(beams))
 
 
+def quantities_of_columns(names: Sequence[str]) -> set[str]:
+    """Return which of x, y, longitude, latitude, shot_number and beam have a column of one of these names."""
+    bare_names = {_bare(name) for name in names}
+    return {quantity for quantity, known in _COLUMNS.items() if bare_names.intersection(known)}
+
+
+def _bare(name: str) -> str:
+    """Return the name of a column in lower case, without spaces and underscores."""
+    return re.sub(r"[\s_\-.]", "", name.lower())
+
+
 def _columns(path: Path, names: list[str]) -> dict[str, int]:
     """Return the number of the column of each quantity. **Warns, raises:** as `read_places`."""
     columns = {}
-    bare_names = [re.sub(r"[\s_\-.]", "", name.lower()) for name in names]
+    bare_names = [_bare(name) for name in names]
     for quantity, known in _COLUMNS.items():
         matches = [i for i, name in enumerate(bare_names) if name in known]
         if quantity == "shot_number" and not matches:
@@ -219,6 +231,8 @@ def _places_of_product(path: Path, crs: str) -> Places:
 
 def _on_map(path: Path, crs: str, degrees: np.ndarray, rows: Sequence[str]) -> np.ndarray:
     """Return longitudes and latitudes as x and y, m; what lies outside the map of a product is not finite."""
+    if crs == GEOGRAPHIC:
+        return degrees
     position = transform(str(path), GEOGRAPHIC, crs, *degrees.T)
     outside = ~np.isfinite(position).all(axis=1)
     if outside.any():

@@ -58,6 +58,17 @@ def no_compilation_cache(monkeypatch):
             "height: 12 to 12 m\ncolumns: Easting as x, Northing as y, Ht [m] as height\n",
         ),
         (
+            "shots.csv",
+            "Easting,Northing,id\n500010.5,5500020,7\n500070,5500020,8\n",
+            "places of 2 footprints: x 500010.50 to 500070.00 m, y 5500020.00 to 5500020.00 m\n",
+        ),
+        (
+            "shots.csv",
+            "shot_number,beam,lat,lon,height,time\n7,BEAM0011,50,15,12,3.5\n8,BEAM0000,50.5,14.5,13,4.5\n",
+            "places of 2 footprints: longitude 14.50000 to 15.00000 degrees, "
+            "latitude 50.00000 to 50.50000 degrees, beams BEAM0000, BEAM0011\n",
+        ),
+        (
             "leaf.csv",
             "wavelength,controlled reflectance\n400,0.1\n500,0.2\n",
             "spectrum 'leaf' of 2 samples from 400 to 500 nm",
