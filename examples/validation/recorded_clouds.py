@@ -21,6 +21,8 @@ from jaxlidar.io import read_las
 
 # Standard deviations of footprint and pulse, m, and the edge of the cells in which last returns are counted.
 FOOTPRINT, PULSE, CELL = 5.5, 0.95485, 1.5
+# How far from its centre the simulator follows such a footprint, m. Its cells begin one edge within that.
+REACH = 17.4
 ALTITUDE = 4e5
 # Reflectance and transmittance of leaves: 2/3 of 0.45 is the reflectance of the ground, 0.3.
 LEAF = (0.45, 0.45)
@@ -43,14 +45,17 @@ def middles_of_samples(reference):
     return first + (last - first) * (np.arange(samples) + 0.5) / samples
 
 
-def sums_of_points(points, place, height):
-    """Return the sum of points under each footprint, (footprints, samples), and its fraction of plants."""
+def sums_of_points(points, place, height, moved=0.0):
+    """Return the sum of points under each footprint, (footprints, samples), and its fraction of plants.
+
+    `moved`: how far the cells in which last returns are counted are from those of the simulator, m.
+    """
     position, is_last = points.position, points.return_number == points.number_of_returns
     waveforms, cover = [], []
     for centre, z in zip(place, height):
         offset = position[:, :2] - centre
-        near = np.flatnonzero(np.hypot(*offset.T) < 4.0 * FOOTPRINT)
-        cell = np.floor(offset[near] / CELL).astype(int) + 20
+        near = np.flatnonzero(np.hypot(*offset.T) < REACH)
+        cell = np.floor((offset[near] + REACH - CELL - moved) / CELL).astype(int) + 2
         index = cell[:, 0] * 40 + cell[:, 1]
         last_returns = np.bincount(index, is_last[near], 1600)[index]
         weight = np.exp(-0.5 * np.sum(offset[near] ** 2, axis=1) / FOOTPRINT**2)

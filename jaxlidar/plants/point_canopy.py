@@ -53,7 +53,7 @@ from jaxlidar.scenes.voxels import VoxelMap
 # Classes of the LAS specification: ground and water, which no light passes; never classified.
 _GROUND_CLASSES, _UNCLASSIFIED = (2, 9), (0, 1)
 # Edge of the cells in which last returns are counted, m, as the GEDI simulator has it.
-_DENSITY_CELL = 2.0
+_DENSITY_CELL = 1.5
 # Returns within the smoothing Gaussian, and standard deviation of the neighbourhood, m.
 _SMOOTHED_RETURNS, _NEIGHBOURHOOD = 20.0, 5.0
 # Largest probability of interception of a voxel: the lowest returns of a column would be a solid layer.

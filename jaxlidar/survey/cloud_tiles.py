@@ -109,7 +109,7 @@ def simulate_tiles(
     folder: str | os.PathLike[str],
     *,
     key: PRNGKeyArray,
-    voxel_size: float | tuple[float, float, float] = (2.0, 2.0, 1.0),
+    voxel_size: float | tuple[float, float, float] = (2.0, 2.0, 0.5),
     tile: float = 100.0,
     rtol: float = 0.03,
     executor: Executor | None = None,
@@ -131,7 +131,7 @@ def simulate_tiles(
       are there, also after it was killed; a tile is simulated again where its points, its shots or an
       argument have changed. Missing folders are created.
     - `key`: a JAX random key. The same key gives the same waveforms.
-    - `voxel_size`: voxel edges in m, as for `canopy_from_points`. Default (2, 2, 1): finer ones change
+    - `voxel_size`: voxel edges in m, as for `canopy_from_points`. Default (2, 2, 0.5): finer ones change
       footprints of 20 m little, and take longer.
     - `tile`: edge of a tile in m, positive. Large tiles take more memory; small ones share less of the work
       between shots. Default 100.

@@ -181,11 +181,11 @@ def test_footprints_become_a_file_and_a_table(tmp_path, cloud, capsys, monkeypat
         return parts
 
     monkeypatch.setattr(footprints.jl, "simulate_tiles", interrupted)
-    status, _, _ = run(tmp_path, cloud, "--link-margin", "3")
+    status, _, _ = run(tmp_path, cloud, "--link-margin", "3", "--seed", "1")
     assert status == INTERRUPTED
     assert "the same command continues" in capsys.readouterr().err
     assert not (tmp_path / "l1b.h5").exists()
-    status, shots, table = run(tmp_path, cloud, "--link-margin", "3")
+    status, shots, table = run(tmp_path, cloud, "--link-margin", "3", "--seed", "1")
     # The tiles of the interrupted run were used, and are not needed any more.
     assert calls[0] == calls[1]
     assert not (tmp_path / "l1b.h5.tiles").exists()
