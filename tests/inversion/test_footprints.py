@@ -347,3 +347,25 @@ def test_a_scheduler_of_dask_needs_dask(tmp_path, cloud, monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "distributed", None)
     with pytest.raises(ImportError, match=r"jaxlidar\[cluster\]"):
         run(tmp_path, cloud, "--workers", "tcp://127.0.0.1:1")
+
+
+@pytest.mark.slow
+# Warnings of Dask itself.
+@pytest.mark.filterwarnings("ignore::DeprecationWarning:(distributed|dask|tornado|zict).*")
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+def test_a_scheduler_of_dask_writes_what_one_process_does(tmp_path, cloud):
+    distributed = pytest.importorskip("distributed")
+    # In two tiles.
+    places = f"x,y\n{EAST + 60},{NORTH + 60}\n{EAST + 110},{NORTH + 60}\n"
+    _, expected, table = run(tmp_path, cloud, "--link-margin", "3", places=places)
+    quiet = {"dashboard_address": None, "silence_logs": "CRITICAL"}
+    # Threads of this process compile nothing twice; what they are sent is pickled all the same.
+    with distributed.LocalCluster(
+        n_workers=2, threads_per_worker=1, processes=False, protocol="tcp", **quiet
+    ) as cluster:
+        options = ("--link-margin", "3", "--workers", cluster.scheduler_address)
+        _, shots, other_table = run(tmp_path, cloud, *options, places=places)
+    assert table == other_table
+    for shot, other in zip(expected, shots, strict=True):
+        assert shot.shot_number == other.shot_number
+        np.testing.assert_array_equal(shot.signal, other.signal)

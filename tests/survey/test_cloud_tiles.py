@@ -1,5 +1,6 @@
 """Surveys over clouds in many files: borders of tiles and files, gaps, resuming, workers, and refusals."""
 
+import contextlib
 import itertools
 from concurrent.futures import ThreadPoolExecutor
 
@@ -130,13 +131,29 @@ def test_an_interrupted_run_goes_on_with_the_same_bits(halves, tmp_path, monkeyp
     assert len(list((tmp_path / "part").glob("*.nc"))) == 4
 
 
+@contextlib.contextmanager
+def dask_executor():
+    """The workers of a Dask scheduler, in threads of this process; what they are sent is pickled."""
+    distributed = pytest.importorskip("distributed")
+    options = {"n_workers": 1, "threads_per_worker": 1, "processes": False, "protocol": "tcp"}
+    with (
+        distributed.LocalCluster(**options, dashboard_address=None, silence_logs="CRITICAL") as cluster,
+        distributed.Client(cluster, set_as_default=False) as client,
+    ):
+        yield client.get_executor()
+
+
+# Warnings of Dask itself.
+@pytest.mark.filterwarnings("ignore::DeprecationWarning:(distributed|dask|tornado|zict).*")
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
 def test_workers_give_the_same_bits(halves, tmp_path):
     survey, options = survey_at(*BORDERS[:2]), {"key": KEY, "tile": 20.0, "rtol": 0.1}
     parts = jl.simulate_tiles(halves, survey, tmp_path / "here", **options)
-    with ThreadPoolExecutor(1) as executor:
-        others = jl.simulate_tiles(halves, survey, tmp_path / "there", **options, executor=executor)
-    for (_, waves), (_, expected) in zip(others, parts, strict=True):
-        assert np.array_equal(waves.recorded, expected.recorded)
+    for name, executors in (("threads", ThreadPoolExecutor(1)), ("dask", dask_executor())):
+        with executors as executor:
+            others = jl.simulate_tiles(halves, survey, tmp_path / name, **options, executor=executor)
+        for (_, waves), (_, expected) in zip(others, parts, strict=True):
+            assert np.array_equal(waves.recorded, expected.recorded)
 
 
 @pytest.mark.parametrize(
