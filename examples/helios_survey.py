@@ -6,8 +6,9 @@ What is left out, or taken as something else, is printed. `--every 100` takes on
 """
 
 import argparse
+import contextlib
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -24,6 +25,8 @@ FORWARD = np.array([0.0, 1.0, 0.0])
 # Reflectance of all parts: spectra of HELIOS++ are not read.
 REFLECTANCE = 0.4
 LOADERS = ("objloader", "geotiffloader", "xyzloader", "detailedvoxels")
+# Most pulses of a leg, which take a few GB.
+MAX_PULSES = 10_000_000
 
 
 class Simulation(NamedTuple):
@@ -74,6 +77,15 @@ def parsed(path: Path) -> ElementTree.Element:
         raise ValueError(f"{path}: no XML: {error}") from error
 
 
+@contextlib.contextmanager
+def named(path: Path) -> Iterator[None]:
+    """Name the file in the errors of what is read from it."""
+    try:
+        yield
+    except (ValueError, IndexError) as error:
+        raise ValueError(f"{path}: {error}") from error
+
+
 def number(
     element: ElementTree.Element | Mapping[str, str], name: str, default: float | None = None
 ) -> float:
@@ -87,6 +99,16 @@ def number(
         value = np.nan
     if not np.isfinite(value):
         raise ValueError(f"{name} = {text!r}; admissible is a number")
+    return value
+
+
+def positive(
+    element: ElementTree.Element | Mapping[str, str], name: str, default: float | None = None
+) -> float:
+    """Return an attribute as a number above 0. **Raises:** ValueError, naming it, where it is none."""
+    value = number(element, name, default)
+    if not value > 0.0:
+        raise ValueError(f"{name} = {value:g}; admissible is a number above 0")
     return value
 
 
@@ -135,8 +157,9 @@ def cubes_of_voxels(path: Path) -> jl.Mesh:
         raise ValueError(
             f"{path}: its head has no min_corner, res or columns i, j and k, or no voxel follows"
         )
-    edge, index = float(head["res:"][0]), np.loadtxt(lines[first + 1 :], usecols=(0, 1, 2), ndmin=2)
-    return cubes(np.array(head["min_corner:"], float) + edge * index, edge)
+    with named(path):
+        edge, index = float(head["res:"][0]), np.loadtxt(lines[first + 1 :], usecols=(0, 1, 2), ndmin=2)
+        return cubes(np.array(head["min_corner:"], float) + edge * index, edge)
 
 
 class Part(NamedTuple):
@@ -188,9 +211,10 @@ def mesh_of_part(part: Part, n: int) -> jl.Mesh:
     if part.loader == "xyzloader":
         separator = options.get("separator", " ")
         layout = {"delimiter": separator.strip() or None, "comments": ("#", "//")}
-        points = np.loadtxt(part.path, **layout, usecols=(0, 1, 2), ndmin=2)
-        edge = number(options, "voxelSize")
-        mesh = cubes(np.unique(np.floor(points / edge), axis=0) * edge, edge)
+        edge = positive(options, "voxelSize")
+        with named(part.path):
+            points = np.loadtxt(part.path, **layout, usecols=(0, 1, 2), ndmin=2)
+            mesh = cubes(np.unique(np.floor(points / edge), axis=0) * edge, edge)
     elif part.loader == "detailedvoxels":
         mesh = cubes_of_voxels(part.path)
     else:
@@ -308,7 +332,7 @@ def legs_of(root: ElementTree.Element, scanner: ElementTree.Element) -> list[dic
                 settings |= element.attrib
         resolution = [number(settings, f"{way}Resolution_deg", 0.0) for way in ("vertical", "horizontal")]
         if all(resolution):
-            largest = 2.0 * number(scanner, "scanAngleMax_deg")
+            largest = 2.0 * positive(scanner, "scanAngleMax_deg")
             lines = resolution[0] * number(settings, "pulseFreq_hz") / largest
             settings |= {"scanFreq_hz": str(lines), "headRotatePerSec_deg": str(resolution[1] * lines)}
         legs.append(settings)
@@ -339,7 +363,7 @@ def read_survey(path: Path, every: int = 1) -> Simulation:
     turn, emitter = rotations(mount), rotations(origin)
     arm = TO_BODY @ (vector(mount) + turn @ vector(origin))
     legs, strips, start = legs_of(root, scanner), [], 0.0
-    lidar = read_lidar(scanner, number(legs[0], "pulseFreq_hz")) if legs else jl.Lidar()
+    lidar = read_lidar(scanner, positive(legs[0], "pulseFreq_hz")) if legs else jl.Lidar()
     places = [np.array([number(leg, a, 0.0) for a in "xyz"]) for leg in legs]
     for place, leg in zip(places, legs):
         if leg.get("onGround") in ("true", "1", "-1"):
@@ -347,12 +371,18 @@ def read_survey(path: Path, every: int = 1) -> Simulation:
     for k, leg in enumerate(legs):
         head, stop, speed = (number(leg, f"headRotate{w}_deg", 0.0) for w in ("Start", "Stop", "PerSec"))
         way = places[min(k + 1, len(legs) - 1)] - places[k] if not is_static else np.zeros(3)
-        duration = np.linalg.norm(way) / number(leg, "movePerSec_m", 70.0) if way.any() else 0.0
+        duration = np.linalg.norm(way) / positive(leg, "movePerSec_m", 70.0) if way.any() else 0.0
         if is_static:
             duration = number(leg, "maxDuration_s", abs(stop - head) / abs(speed) if speed else 0.0)
         if leg.get("active") == "false" or duration == 0.0:
             continue
-        time = np.arange(0.0, duration, every / number(leg, "pulseFreq_hz"))
+        interval = every / positive(leg, "pulseFreq_hz")
+        if duration > MAX_PULSES * interval:
+            raise ValueError(
+                f"leg {k + 1} sends {duration / interval:.3g} pulses; admissible are {MAX_PULSES:,}: "
+                f"take one of more than every = {every}"
+            )
+        time = np.arange(0.0, duration, interval)
         beam = deflections(scanner, leg, time) @ emitter.T
         beam = np.einsum("sij,sj->si", turn @ rotation(AXES["z"], head + speed * time), beam) @ TO_BODY.T
         (sent,) = np.nonzero(np.isfinite(beam[:, 0]))

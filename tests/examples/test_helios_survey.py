@@ -1,12 +1,14 @@
 """The example reads small surveys of HELIOS++, and says what it does not map."""
 
 import importlib.util
+import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 import jaxlidar as jl
+from tests.fuzz.fuzz_changes import WORDS, change_text, choose
 
 PATH = Path(__file__).resolve().parents[2] / "examples" / "helios_survey.py"
 SQUARE = "v -1 -1 0\nv 1 -1 0\nv 1 1 0\nv -1 1 0\nf 1 2 3 4\n"
@@ -203,3 +205,88 @@ def test_the_whole_run_labels_points_by_their_parts(example, make, tmp_path, cap
     np.testing.assert_allclose(returns.position[is_wall, 1], 10.0, atol=0.05)
     np.testing.assert_allclose(returns.position[returns.instance == 1, 2], 0.0, atol=0.05)
     assert len(jl.io.read_las(tmp_path / "a.las").position) == len(returns)
+
+
+# -- mutants -----------------------------------------------------------------------------------------------
+
+VOXELS = """VOXEL SPACE
+#min_corner: -2 -2 0
+#max_corner: 2 2 4
+#split: 2 2 2
+#res: 2
+i j k PadBVTotal
+0 0 0 0.5
+0 1 1 1.5
+"""
+# Words that XML admits, and others that mean something to HELIOS++.
+VALUES = [word for word in WORDS if word.isprintable() and len(word) < 100]
+VALUES += ["static", "risley", "xyzloader", "scaled", "true", "a.vox", "1e6", "1e12", "1e-9", "-5"]
+
+
+def change_xml(random, content):
+    """Change or drop an attribute, or drop an element, of an XML file."""
+    root = ElementTree.fromstring(content)
+    elements = [element for element in root.iter() if element.attrib]
+    element = choose(random, elements) if elements else root
+    if random.uniform() < 0.2 and len(element):
+        element.remove(choose(random, list(element)))
+    elif element.attrib:
+        name = choose(random, sorted(element.attrib))
+        element.attrib.pop(name)
+        if random.uniform() < 0.8:
+            element.set(name, choose(random, VALUES))
+    return ElementTree.tostring(root)
+
+
+def part_of(loader, name, **options):
+    parameters = "".join(f'<param key="{k}" value="{v}"/>' for k, v in {"filepath": name, **options}.items())
+    return f'<part><filter type="{loader}">{parameters}</filter></part>'
+
+
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("kind", ["tripod", "plane"])
+def test_mutants_of_surveys_are_read_or_refused(example, make, tmp_path, kind):
+    voxels = part_of("detailedvoxels", "a.vox"), part_of("detailedvoxels", "a.vox", intersectionMode="fixed")
+    parts = GROUND + WALL + "".join(voxels) + part_of("xyzloader", "a.xyz", voxelSize=0.5)
+    if kind == "tripod":
+        path = make(TURN, parts, root='<scannerSettings id="set" pulseFreq_hz="1000" scanFreq_hz="5"/>')
+    else:
+        path = make(FLY.format(z=100), parts, "plane", scanner="swing")
+    (tmp_path / "a.vox").write_text(VOXELS)
+    (tmp_path / "a.xyz").write_text("1 2 3\n4 5 6\n")
+    files = [*(tmp_path / "data").iterdir(), *(tmp_path / name for name in ("square.obj", "a.vox", "a.xyz"))]
+    originals = {file: file.read_bytes() for file in sorted(files)}
+    random, surveys, errors = np.random.default_rng(len(kind)), [], []
+    for _ in range(30):
+        file = choose(random, [*originals])
+        content = originals[file]
+        for _ in range(int(random.integers(1, 4))):
+            content = (
+                change_xml(random, content) if file.suffix == ".xml" else change_text(random, content)[0]
+            )
+        file.write_bytes(content)
+        try:
+            surveys.append(example.read_survey(path, every=10).survey)
+        except (ValueError, FileNotFoundError) as error:
+            errors.append((file, str(error)))
+        file.write_bytes(originals[file])
+    assert len(surveys) > 5
+    assert len(errors) > 5
+    assert all(np.isfinite(survey.sensor).all() and np.isfinite(survey.zenith).all() for survey in surveys)
+    # Files of parts are named, and attributes of XML.
+    unnamed = [error for file, error in errors if file.suffix != ".xml" and file.name not in error]
+    assert all(error.startswith("mesh: ") for error in unnamed), unnamed
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ('movePerSec_m="1e-9"', r"leg 1 sends 1e\+12 pulses; admissible are 10,000,000: .* every = 1"),
+        ('movePerSec_m="0"', "movePerSec_m = 0; admissible is a number above 0"),
+        ('movePerSec_m="10" pulseFreq_hz="0"', "pulseFreq_hz = 0; admissible is a number above 0"),
+    ],
+)
+def test_numbers_without_an_end_are_refused(example, make, change, message):
+    legs = FLY.format(z=9).replace('movePerSec_m="10"', change)
+    with pytest.raises(ValueError, match=message):
+        example.read_survey(make(legs, platform="plane", scanner="swing"))
