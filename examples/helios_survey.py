@@ -25,8 +25,8 @@ FORWARD = np.array([0.0, 1.0, 0.0])
 # Reflectance of all parts: spectra of HELIOS++ are not read.
 REFLECTANCE = 0.4
 LOADERS = ("objloader", "geotiffloader", "xyzloader", "detailedvoxels")
-# Most pulses of a leg, which take a few GB.
-MAX_PULSES = 10_000_000
+# Most pulses of a leg: more is no survey, but a speed or a rate of another unit.
+MAX_PULSES = 100_000_000
 
 
 class Simulation(NamedTuple):

@@ -281,7 +281,7 @@ def test_mutants_of_surveys_are_read_or_refused(example, make, tmp_path, kind):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ('movePerSec_m="1e-9"', r"leg 1 sends 1e\+12 pulses; admissible are 10,000,000: .* every = 1"),
+        ('movePerSec_m="1e-9"', r"leg 1 sends 1e\+12 pulses; admissible are 100,000,000: .* every = 1"),
         ('movePerSec_m="0"', "movePerSec_m = 0; admissible is a number above 0"),
         ('movePerSec_m="10" pulseFreq_hz="0"', "pulseFreq_hz = 0; admissible is a number above 0"),
     ],
