@@ -950,8 +950,9 @@ def _place(lidar: Lidar, position: Any, altitude: Any, sensor: Any) -> Float[np.
     check_range(field, value)
     positions = as_numpy(value, field)
     if positions.ndim != 2 or positions.shape[1] != size or len(positions) == 0:
+        hint = "; places of sensors are sensor=" if size == 2 and positions.shape[1:] == (3,) else ""
         raise ValueError(
-            f"{field} has shape {positions.shape}; admissible is (shots, {size}), one shot or more"
+            f"{field} has shape {positions.shape}; admissible is (shots, {size}), one shot or more{hint}"
         )
     return positions
 

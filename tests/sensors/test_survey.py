@@ -133,6 +133,7 @@ LIDAR, NADIR = jl.Lidar(), [(0.0, 0.0), (1.0, 1.0)]
         (lambda: jl.Survey(jl.Scene(), NADIR), TypeError, "lidar"),
         (lambda: jl.Survey(LIDAR, [0.0, 1.0]), ValueError, r"position has shape \(2,\)"),
         (lambda: jl.Survey(LIDAR, np.zeros((0, 2))), ValueError, r"position has shape \(0, 2\)"),
+        (lambda: jl.Survey(LIDAR, np.zeros((4, 3))), ValueError, r"position has shape \(4, 3\).*sensor="),
         (lambda: jl.Survey(LIDAR, [(0.0, np.nan)]), ValueError, "position = nan"),
         (lambda: jl.Survey(LIDAR, "here"), TypeError, "position is a str"),
         (lambda: jl.Survey(LIDAR, NADIR, zenith=[1, 2, 3]), ValueError, r"zenith has shape \(3,\).*\(2,\)"),
