@@ -418,10 +418,17 @@ def las_points(
     check_range("position", position, -MAX_COORDINATE, MAX_COORDINATE)
     fields = {name: np.asarray(values) for name, values in fields.items()}
     is_format_6 = point_format >= _FORMAT_6
-    of_format = "" if is_format_6 else f" of point format {point_format} (6 to 10 hold more)"
+
+    def check_field(name: str, values: np.ndarray, low: float, high: float) -> None:
+        try:
+            check_range(name, values, low, high)
+        except ValueError as error:
+            hint = "" if is_format_6 else f" of point format {point_format}; formats 6 to 10 hold more"
+            raise ValueError(f"{error}{hint}") from None
+
     if "scan_angle" in fields:
         limit, step = _MAX_SCAN_ANGLES[is_format_6], _SCAN_ANGLE_STEPS[is_format_6]
-        check_range(f"scan_angle{of_format}", fields["scan_angle"], -limit, limit)
+        check_field("scan_angle", fields["scan_angle"], -limit, limit)
         name = "scan_angle" if is_format_6 else "scan_angle_rank"
         fields[name] = np.round(fields.pop("scan_angle") / step)
     for name, values in fields.items():
@@ -429,7 +436,7 @@ def las_points(
         if name not in _MAX_NUMBERS:
             check_range(name, values)
             continue
-        check_range(f"{name}{of_format}", values, 0, _MAX_NUMBERS[name][is_format_6])
+        check_field(name, values, 0, _MAX_NUMBERS[name][is_format_6])
         if np.any(values != np.floor(values)):
             raise ValueError(f"{name} has values that are not whole numbers")
     is_geographic = system is not None and system.kind == "geographic"
