@@ -9,7 +9,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Float, Int, PRNGKeyArray
+from jaxtyping import Array, ArrayLike, Float, Int, PRNGKeyArray
 
 from jaxlidar import SPEED_OF_LIGHT
 from jaxlidar.extend import along, check_integer, check_key, check_number, dot
@@ -115,9 +115,16 @@ def _analog_returns(
 
 
 def photon_paths(
-    lidar: Lidar, scene: Scene, plan: Plan, *, key: PRNGKeyArray, n_photons: int, leaving: float = 5.0
+    lidar: Lidar,
+    scene: Scene,
+    plan: Plan,
+    *,
+    key: PRNGKeyArray,
+    n_photons: int,
+    leaving: float = 5.0,
+    source: Float[ArrayLike, "3"] | None = None,
 ) -> Float[Array, "photons points 3"]:
-    """Trace points along the paths of photons, for drawings.
+    """Trace points along the paths of photons.
 
     **Arguments:**
 
@@ -127,26 +134,39 @@ def photon_paths(
     - `key`: a JAX random key.
     - `n_photons`: number of photons, at least 1.
     - `leaving`: length, m, over which photons that leave the scene are followed. Default 5.
+    - `source`: (3,) m, a point that sends photons in all directions, in place of the lidar. Default None.
 
     **Returns:** (photons, points, 3) x, y, z in m, with two points more than the plan has orders: the start
-    above the scene, the collisions, and the end of the path out of the scene. Remaining points repeat the
-    last collision.
+    above the scene or at the source, the collisions, and the end of the path out of the scene. Remaining
+    points repeat the last collision.
 
     **Raises:** ValueError as for `analog_returns`.
     """
     check_kinds(lidar, scene)
     check_key(key)
     check_number("leaving", leaving, 0.0)
-    return _photon_paths(lidar, scene, plan, key, check_integer("n_photons", n_photons), leaving)
+    start = None if source is None else jnp.asarray(source, float) - lidar.aim_point
+    return _photon_paths(lidar, scene, plan, key, check_integer("n_photons", n_photons), leaving, start)
 
 
 @eqx.filter_jit
 def _photon_paths(
-    lidar: Lidar, scene: Scene, plan: Plan, key: PRNGKeyArray, n_photons: int, leaving: float
+    lidar: Lidar,
+    scene: Scene,
+    plan: Plan,
+    key: PRNGKeyArray,
+    n_photons: int,
+    leaving: float,
+    source: Float[Array, "3"] | None,
 ) -> Float[Array, "photons points 3"]:
     device_scene = _build_scene(lidar, scene, plan)
     start_key, key = jax.random.split(key)
-    start = _send_photons(device_scene, n_photons, start_key)
+    if source is None:
+        start = _send_photons(device_scene, n_photons, start_key)
+    else:
+        zero, w = jnp.zeros(n_photons), jax.random.normal(start_key, (n_photons, 3))
+        w = w / jnp.linalg.norm(w, axis=1, keepdims=True)
+        start = _start_photons(tuple(zero + a for a in source), tuple(w.T), zero)
 
     def order_step(p, order):
         onward, _ = _trace_flight(device_scene, p, jax.random.fold_in(key, order), 90.0)

@@ -10,8 +10,9 @@ from pathlib import Path
 import numpy as np
 
 EXAMPLES = Path(__file__).resolve().parents[1]
-# The scripts also use modules of the benchmarks and of the fits of recorded shots.
-sys.path += [folder for folder in (str(EXAMPLES / "benchmarks"), str(EXAMPLES)) if folder not in sys.path]
+# The scripts also use modules of the benchmarks, of the fits of recorded shots, and of the paper.
+FOLDERS = [str(folder) for folder in (EXAMPLES / "benchmarks", EXAMPLES, EXAMPLES / "paper")]
+sys.path += [folder for folder in FOLDERS if folder not in sys.path]
 
 from _common import machine, number, page_of, percent, plt, save_figure, table, write_json  # noqa: E402, F401
 from tqdm import tqdm  # noqa: E402

@@ -196,9 +196,7 @@ def main(argv=None):
         bins; the second, of plane and of point pulses, and the sum of all keep to their errors.""",
         unchecked="""One medium without ends, lit and seen vertically, and samples above 1 % of the largest.
         Not looked at are paths that leave the medium and enter it again, slant light and other phase
-        functions. The benchmarks of plane, point and line pulses (AZURV1, Ganapol) ask for the density of
-        light at distances from a source within the medium; a lidar's receiver is at its source and looks
-        along its beam, so that jaxlidar has no such quantity.""",
+        functions.""",
         draw=draw,
         size=(13.0, 4.5),
         photons=arguments.photons,

@@ -16,7 +16,7 @@ RESULTS = FOLDER / "results"
 # The order of the page: exact references first, then other codes, measurements and records.
 ORDER = (
     *("mpmath_plate", "prosail_leaves", "prosail_canopy", "discrete_ordinates"),
-    *("flight_times", "rami4pilps"),
+    *("flight_times", "infinite_medium", "rami4pilps"),
     *("rami_reflectance", "rami_waveforms"),
     *("mitransient_crown", "mitransient_meshes", "mcx_crown", "multiscatter_slabs"),
     *("standard_errors", "leaf_databases", "recorded_gedi", "recorded_posterior"),

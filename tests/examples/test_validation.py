@@ -238,6 +238,20 @@ def test_times_of_flight(run):
     assert not holds(wrong, "point pulse")
 
 
+@pytest.mark.slow
+def test_pulses_in_an_infinite_medium(run):
+    """Shares of photons hold by their errors; not those of a time that is 5 % longer."""
+    assert holds(run("infinite_medium", "--photons", "100000"))
+
+    def plant(module):
+        exact = dict(module.SHARES)
+        module.SHARES = {k: lambda x, t, f=f: f(x, 1.05 * t) for k, f in exact.items()}
+
+    wrong = run("infinite_medium", "--photons", "100000", planted=plant)
+    for name in ("plane", "line", "point"):
+        assert not holds(wrong, f"{name} pulse")
+
+
 def skip_without(package):
     """Skip the test if a package is missing."""
     # Not imported: mitransient refuses to be, before its script has chosen a variant of Mitsuba.
