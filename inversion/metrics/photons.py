@@ -738,13 +738,16 @@ def _odds_of_hidden_ground(
 
     Below plants of N photons, a ground with the share p of the light returns h = N p / (1 - p) of them. Where
     n are found and b are expected without it, the ratio of the Poisson likelihoods is (1 + h / b)^n exp(-h).
-    Its mean over shares and depths is the odds, if both cases are as likely before.
+    Its mean over shares and depths is the odds, if both cases are as likely before. Segments near an end have
+    the odds of the nearest one with neighbours on both sides: fewer photons would not tell.
 
     **Arguments:** `steps`: (photons,) below the echo, in steps of depth; `number`: of their segments. `near`:
     (segments,) photons in the echo. `background`: (segments,) per m of height. `ground_range`: (segments,) m,
     half the height of the echo.
     """
     background = _moving_sum(background, _HIDDEN_NEIGHBOURS)
+    n, half = near.size, _HIDDEN_NEIGHBOURS
+    nearest = np.clip(np.arange(n), min(half, n // 2), max(n - 1 - half, n // 2))
     echo = np.maximum(_moving_sum(near, _HIDDEN_NEIGHBOURS) - background * 2.0 * ground_range, 0.0)
     ratios = []
     for k in range(_HIDDEN_SLABS):
@@ -756,7 +759,7 @@ def _odds_of_hidden_ground(
         for share in _HIDDEN_SHARES:
             hidden = echo * share / (1.0 - share)
             ratios.append(count * np.log1p(hidden / without) - hidden)
-    return np.exp(scipy.special.logsumexp(ratios, axis=0) - np.log(len(ratios)))
+    return np.exp(scipy.special.logsumexp(ratios, axis=0) - np.log(len(ratios)))[nearest]
 
 
 def _rare_count(expected: np.ndarray, places: np.ndarray | float) -> np.ndarray:

@@ -129,6 +129,24 @@ def test_low_plants_that_hide_their_ground_are_doubtful(monkeypatch):
     assert np.mean(errors_of_good_ones(plants) > 1.0) > 0.5
 
 
+def test_a_hidden_ground_is_looked_for_with_all_neighbours_at_ends_of_a_track_too():
+    """Light from below plants in four segments of twelve, none at the ends."""
+    number = np.repeat(np.arange(4, 8), 3)
+
+    def odds(n_segments, number):
+        near, background, half_height = (np.full(n_segments, x) for x in (15.0, 0.01, 0.75))
+        steps = np.full(number.size, 0.5)
+        return photons._odds_of_hidden_ground(steps, number, near, background, half_height)
+
+    of_track = odds(12, number)
+    assert np.all(of_track[:4] == of_track[4])
+    assert np.all(of_track[-4:] == of_track[-5])
+    assert np.all(of_track > photons._HIDDEN_ODDS)
+    # Fewer segments than neighbours: all of them count, and without any light from below there is no ground.
+    assert np.all(odds(3, number[:0]) == odds(3, number[:0])[0])
+    assert np.all(odds(12, number[:0]) < 0.1)
+
+
 def test_the_background_is_estimated_from_the_record():
     for rate in (1e5, 1e6, 5e6):
         events = events_of(track(10.0), rate)
