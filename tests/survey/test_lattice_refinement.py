@@ -14,6 +14,7 @@ from jaxlidar.survey.choose_strategy import choose_strategy
 from jaxlidar.survey.per_shot import (
     aim_offset,
     begins_with_few_rays,
+    error_of_interleaved,
     lidar_of_shot,
     shot_geometry,
     trace_chunk,
@@ -343,6 +344,14 @@ def test_results_do_not_depend_on_which_shots_are_traced_together():
         all_shots["reflectance"][3:12], nine_shots["reflectance"], rtol=1e-3, atol=1e-6
     )
     np.testing.assert_allclose(all_shots["error"][3:12], nine_shots["error"], rtol=1e-2, atol=1e-5)
+
+
+def test_interleaved_lattices_gain_the_more_the_more_columns_a_beam_crosses():
+    """From (8 lattices)^-1/4 straight down to 8^-0.45 for level beams, which have no sine over cosine."""
+    scene = strategy_of(narrow_shots(2), edge()).context.scene
+    factor = np.asarray(error_of_interleaved(scene, np.array([0.0, 2.0, 10.0, 30.0, 90.0])))
+    assert np.all(np.diff(factor) < 0.0)
+    np.testing.assert_allclose(factor[[0, -1]], 8.0 ** np.array([-0.25, -0.45]), rtol=1e-5)
 
 
 @pytest.mark.slow
