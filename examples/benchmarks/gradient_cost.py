@@ -143,8 +143,8 @@ def draw(record: dict):
     axes.set(xlabel="times one simulation", title="Gradients")
     # The first case on top, and room for the legend beside the bars.
     axes.invert_yaxis()
-    axes.margins(x=0.7)
-    axes.legend(loc="lower right")
+    axes.margins(x=1.0)
+    axes.legend(loc="upper right")
     return figure
 
 
