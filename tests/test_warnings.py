@@ -133,7 +133,6 @@ def simulated(survey, scene):
     return jl.simulate_many(survey, scene, key=KEY, rtol=0.3, max_orders=1)
 
 
-@pytest.mark.slow
 def test_returns_of_crowns_alone():
     """Shots upwards into voxels are told."""
     many = simulated(UPWARDS, crown())

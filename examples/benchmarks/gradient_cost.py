@@ -167,7 +167,7 @@ def section(record: dict) -> str:
         "to the height of the ground, with its value, by `jax.grad` of `simulate(..., plan=)`: "
         f"{record['photons']:,} photons, {record['rays']:,} rays. Times are compared with a compiled "
         "simulation of the same photons, and with `simulate` as it is called outside of a transformation. "
-        "Where voxels are empty, photons are traced once more for what leaves there would scatter. Memory is "
-        "that of temporaries.",
+        "Where voxels are empty or thin, photons are traced once more for what leaves there would scatter. "
+        "Memory is that of temporaries.",
         table(record["cases"], columns),
     )

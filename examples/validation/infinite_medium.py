@@ -101,7 +101,7 @@ def count_photons(arguments):
     scene, lidar = jl.Scene(canopy=canopy), jl.Lidar(wavelength=532.0, altitude=1000.0)
     plan = jl.plan(lidar, scene, max_orders=ORDERS, window=(-300.0, 300.0), histories=True)
     counts = {name: np.zeros((len(TIMES), STEPS)) for name in SHARES}
-    keys = list(jax.random.split(jax.random.key(0), arguments.photons // BATCH))
+    keys = list(jax.random.split(jax.random.key(0), max(1, arguments.photons // BATCH)))
     source = np.array([0.0, 0.0, 0.5 * side])
     for key in with_progress(arguments, keys):
         points = photon_paths(lidar, scene, plan, key=key, n_photons=BATCH, source=source)

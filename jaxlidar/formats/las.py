@@ -419,16 +419,20 @@ def las_points(
     fields = {name: np.asarray(values) for name, values in fields.items()}
     is_format_6 = point_format >= _FORMAT_6
 
-    def check_field(name: str, values: np.ndarray, low: float, high: float) -> None:
+    def check_field(name: str, values: np.ndarray, limits: tuple[tuple[float, float], ...]) -> None:
+        low, high = limits[is_format_6]
         try:
             check_range(name, values, low, high)
         except ValueError as error:
-            hint = "" if is_format_6 else f" of point format {point_format}; formats 6 to 10 hold more"
+            lowest, highest = limits[True]
+            if is_format_6 or not np.all((values >= lowest) & (values <= highest)):
+                raise
+            hint = f" of point format {point_format}; formats 6 to 10 hold more"
             raise ValueError(f"{error}{hint}") from None
 
     if "scan_angle" in fields:
-        limit, step = _MAX_SCAN_ANGLES[is_format_6], _SCAN_ANGLE_STEPS[is_format_6]
-        check_field("scan_angle", fields["scan_angle"], -limit, limit)
+        step = _SCAN_ANGLE_STEPS[is_format_6]
+        check_field("scan_angle", fields["scan_angle"], tuple((-m, m) for m in _MAX_SCAN_ANGLES))
         name = "scan_angle" if is_format_6 else "scan_angle_rank"
         fields[name] = np.round(fields.pop("scan_angle") / step)
     for name, values in fields.items():
@@ -436,7 +440,7 @@ def las_points(
         if name not in _MAX_NUMBERS:
             check_range(name, values)
             continue
-        check_field(name, values, 0, _MAX_NUMBERS[name][is_format_6])
+        check_field(name, values, tuple((0, largest) for largest in _MAX_NUMBERS[name]))
         if np.any(values != np.floor(values)):
             raise ValueError(f"{name} has values that are not whole numbers")
     is_geographic = system is not None and system.kind == "geographic"

@@ -77,7 +77,8 @@ class ExtraDimension(NamedTuple):
         values = values if self.scale is None else values * self.scale
         values = values if self.offset is None else values + self.offset
         if self.no_data is not None:
-            values = np.where(counts == self.no_data, np.nan, values)
+            # Single precision rounds what the header has in double.
+            values = np.where(counts == self.no_data.astype(counts.dtype), np.nan, values)
         return values if self.dtype.shape else values[:, 0]
 
 

@@ -183,19 +183,20 @@ def check_memory(
     """
     if size <= limit:
         return
-    ways = (
-        "follow fewer orders (max_orders=), record a shorter window (window=), use wider fine bins "
-        "(bin_width=), or have fewer plates or materials"
+    fewer_orders = "" if first_order > limit else "follow fewer orders (max_orders=), "
+    remedies = (
+        f"{fewer_orders}record a shorter window (window=), use wider fine bins (bin_width=), or have fewer "
+        "plates or materials"
     )
     if wavelengths > MAX_APPLIED_WAVELENGTHS:
-        ways += f", or at most {MAX_APPLIED_WAVELENGTHS} wavelengths"
+        remedies += f", or at most {MAX_APPLIED_WAVELENGTHS} wavelengths"
     # Histories of order one are kept in any case: of n plates they are C(4 n + 2, 2 n + 1).
-    if n_plates and first_order > limit:
-        ways = (
-            f"have fewer than {n_plates} plates, since order one alone takes {format_bytes(first_order)} for "
-            "their histories; many layers of leaves are the voxels of one canopy"
+    if n_plates > 1 and first_order > limit:
+        remedies += (
+            f"; order one alone takes {format_bytes(first_order)}, for the histories of {n_plates} plates: "
+            "many layers of leaves are the voxels of one canopy"
         )
     raise ValueError(
         f"the simulation would take about {format_bytes(size)} of memory; admissible is max_memory = "
-        f"{limit / 1e9:.3g} GB: {ways}"
+        f"{limit / 1e9:.3g} GB: {remedies}"
     )

@@ -21,8 +21,8 @@ traced together (`trace.first.lattices_of_shots`). The lattices of a shot interl
 lattice of eight times as many rays, which has no gaps. If a lattice of N rays has the error c N^-a, that of
 all eight is c (8 N)^-a. It is 8^(1/2 - a) times what their scatter tells, the standard error of the mean of
 eight independent ones. Seen from straight above, returns jump at the edges of columns: a = 3/4. A slant beam
-enters voxels by their sides as well, so that returns bend where they would jump, the more the more columns it
-crosses: a grows up to 0.95, found by trial (`error_of_interleaved`).
+enters voxels by their sides as well, so that returns bend where they would jump, and more so the more columns
+it crosses: a grows up to 0.95, found by trial (`error_of_interleaved`).
 Round Gaussian beams straight down have rays in every column that they graze, weighted by its share of the
 energy (`trace.first.lattices_of_shots.strips_of_columns`), so that no error stays unseen for want of rays.
 `examples/validation/standard_errors.py` compares the errors that follow with the scatter of many keys. Shots
@@ -524,23 +524,23 @@ def error_of_interleaved(scene: DeviceScene, zenith: Array | np.ndarray) -> Arra
     """Return the standard error of the mean of interleaved lattices over that of as many independent ones.
 
     For lattices of N rays, with the error N^-a, it is 8^(1/2 - a) for eight of them. A beam that crosses m
-    columns of voxels has a = 0.75 + 0.2 m / (m + 3), which made the errors of narrow shots over voxels of
-    0.25 and 1 m, at 2 to 30 degrees, what their scatter is.
+    columns of voxels has a = 0.75 + 0.2 m / (m + 3), found by trial: errors of narrow shots over voxels of
+    0.25 and 1 m are then near their scatter, but too small where a beam crosses half a column to one.
 
     `zenith`: degrees, of the beam.
     """
-    sideways, column = way_across_columns(scene, zenith)
+    sideways, column = sideways_path_and_column(scene, zenith)
     slant = sideways / (sideways + _COLUMNS_AT_HALF * column)
     return MIN_BATCHES ** (0.5 - _RATE_AT_NADIR - _RATE_OF_SLANT * slant)
 
 
 def is_slant(scene: DeviceScene, zenith: Array | np.ndarray) -> Array:
     """Return True for beams that cross half a voxel on their way through the map; `zenith`: degrees."""
-    sideways, column = way_across_columns(scene, zenith)
+    sideways, column = sideways_path_and_column(scene, zenith)
     return sideways > 0.5 * column
 
 
-def way_across_columns(scene: DeviceScene, zenith: Array | np.ndarray) -> tuple[Array, Array]:
+def sideways_path_and_column(scene: DeviceScene, zenith: Array | np.ndarray) -> tuple[Array, Array]:
     """Return how far beams go sideways through the map, and the width of a column, both times cos(zenith)."""
     assert scene.medium is not None
     angle, size = jnp.deg2rad(zenith), scene.medium.size

@@ -1171,10 +1171,10 @@ def _assemble(
         n_shots=len(waves),
         crs=waves.crs,
     )
-    return returns if max_returns is None else strongest(returns, max_returns)
+    return returns if max_returns is None else strongest_returns(returns, max_returns)
 
 
-def strongest(returns: DiscreteReturns, max_returns: int) -> DiscreteReturns:
+def strongest_returns(returns: DiscreteReturns, max_returns: int) -> DiscreteReturns:
     """Return the `max_returns` strongest returns of each shot, numbered anew."""
     by_strength = np.lexsort((-returns.amplitude, returns.shot))
     rank = np.empty(len(returns), int)

@@ -39,7 +39,7 @@ from jaxlidar.survey.returns import (
     input_of_waveform,
     input_of_waveforms,
     returns_of,
-    strongest,
+    strongest_returns,
     true_returns_of,
     warn_of_expected_returns,
     wavelength_index,
@@ -389,14 +389,15 @@ class Waveforms(eqx.Module):
         returns = self.returns(detector, **options)
         if "max_returns" in options or len(returns) == 0 or returns.n_returns.max() <= MAX_LAS_RETURNS:
             return returns
-        kept = strongest(returns, MAX_LAS_RETURNS)
+        written = strongest_returns(returns, MAX_LAS_RETURNS)
         shots = len(np.unique(returns.shot[returns.n_returns > MAX_LAS_RETURNS]))
         warn_user(
-            f"{len(returns) - len(kept)} of {len(returns)} returns are not written, the weakest of {shots} "
-            f"shots: LAS holds {MAX_LAS_RETURNS} of each; max_returns={MAX_LAS_RETURNS} asks for these",
+            f"{len(returns) - len(written)} of {len(returns)} returns are not written, the weakest of "
+            f"{shots} shots: LAS holds {MAX_LAS_RETURNS} of each; max_returns={MAX_LAS_RETURNS} asks for "
+            "these",
             FileWarning,
         )
-        return kept
+        return written
 
     def to_las_waveforms(
         self,

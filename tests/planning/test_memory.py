@@ -45,7 +45,7 @@ def test_many_plates_are_refused_before_anything_is_allocated():
         jl.plan(lidar, scene, max_orders=12, describe=False)
     # Nothing but fewer plates helps there.
     scene = jl.Scene(plates=plates(19), ground=GROUND)
-    with pytest.raises(ValueError, match=r"GB: have fewer than 19 plates, .* voxels of one canopy$"):
+    with pytest.raises(ValueError, match=r"or have fewer plates .*; order one alone .* of one canopy$"):
         jl.plan(jl.Lidar(), scene, max_orders=1, describe=False)
 
 

@@ -192,8 +192,7 @@ def test_a_sensor_in_a_triangle_is_refused(offset):
     jl.plan(jl.Lidar(sensor=(70.0, 2.0, 5.0 + offset)), scene)
 
 
-@pytest.mark.slow
-def test_an_energy_budget_of_more_than_the_light_is_an_error(monkeypatch):
+def test_an_energy_budget_of_more_than_the_light_is_an_error():
     budget, stderr = (
         {"returned": jnp.array([0.7]), "escaped": jnp.array([0.5])},
         {"escaped": jnp.array([0.01])},
@@ -202,7 +201,10 @@ def test_an_energy_budget_of_more_than_the_light_is_an_error(monkeypatch):
     with pytest.raises(RuntimeError, match="sums to 15 % more"):
         refuse_excess(np.array([0.0, 0.15]))
     refuse_excess(np.array([-1.0, 0.0]))
-    # Planted: every run looks at its budget.
+
+
+@pytest.mark.slow
+def test_every_run_looks_at_its_budget(monkeypatch):
     for module in ("jaxlidar.simulation.one_scene", "jaxlidar.simulation.energy", "jaxlidar.survey.collect"):
         # By its name in `sys.modules`: `jaxlidar.simulate` is also a function.
         monkeypatch.setattr(

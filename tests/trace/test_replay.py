@@ -196,9 +196,12 @@ def test_few_numbers_have_the_same_derivatives_in_directions(monkeypatch):
 @pytest.mark.slow
 @pytest.mark.parametrize(("zenith", "orders"), [(0.0, 2), (12.0, 3)])
 def test_second_derivatives_by_forward_over_reverse(zenith, orders):
-    """The Hessian is symmetric, and that of forward mode within forward mode."""
+    """The Hessian is that of forward mode within forward mode, and symmetric.
+
+    Where voxels are thin, it is symmetric in the mean over keys alone: rows have placed collisions.
+    """
     loss, key = problem(leaves_over_ground, zenith, orders, n_photons=256, n_rays=128), jax.random.key(1)
-    leaf = START["leaf"] + 0.05
+    leaf, thin_leaf = START["leaf"] + 0.05, START["leaf"] + 0.02
     v, w = jnp.asarray(np.random.default_rng(5).normal(size=(2, *leaf.shape)), leaf.dtype)
 
     def of_leaf(leaf):
@@ -207,11 +210,12 @@ def test_second_derivatives_by_forward_over_reverse(zenith, orders):
     def slope(leaf):
         return jax.jvp(of_leaf, (leaf,), (v,))[1]
 
-    product = jax.jit(lambda v: jax.jvp(jax.grad(of_leaf), (leaf,), (v,))[1])
-    forward = jax.jit(lambda w: jax.jvp(slope, (leaf,), (w,))[1])(w)
-    np.testing.assert_allclose(jnp.sum(w * product(v)), forward, rtol=1e-4)
-    np.testing.assert_allclose(jnp.sum(v * product(w)), forward, rtol=1e-4)
-    assert forward != 0.0
+    product = jax.jit(lambda leaf, v: jax.jvp(jax.grad(of_leaf), (leaf,), (v,))[1])
+    forward = jax.jit(lambda leaf: jax.jvp(slope, (leaf,), (w,))[1])
+    for leaves in (leaf, thin_leaf):
+        np.testing.assert_allclose(jnp.sum(v * product(leaves, w)), forward(leaves), rtol=1e-4)
+    np.testing.assert_allclose(jnp.sum(w * product(leaf, v)), forward(leaf), rtol=1e-4)
+    assert forward(leaf) != 0.0
 
 
 @pytest.mark.slow

@@ -214,15 +214,15 @@ def with_replay(
             by_leaf = dict(zip(varying, tangents))
             of_tables = ExtinctionTables(*(by_leaf.get(number) for number in tables))
             has_tables = any(t is not None for t in of_tables)
+            fixed = scene_and_numbers(leaves, "forward")[0].medium
 
             def of_varying(values: list[Array]) -> Traced:
                 scene, numbers = scene_and_numbers(_replaced(leaves, varying, values), "forward")
                 if has_tables:
-                    assert scene.medium is not None
-                    # Collisions in thin voxels are those of `add_tangents`.
-                    medium = dataclasses.replace(scene.medium, thin_collide=add_tangents is None)
                     # Leaves in empty voxels around the box of occupied ones would attenuate, too.
-                    scene = dataclasses.replace(scene, medium=medium, occupied_box=None)
+                    scene = dataclasses.replace(scene, occupied_box=None)
+                    if add_tangents is not None:
+                        scene = _without_thin_collisions(scene, fixed)
                 return trace(scene, numbers)
 
             pushed = jax.jvp(of_varying, ([leaves[i] for i in varying],), (tangents,))[1]
@@ -238,6 +238,24 @@ def with_replay(
 
     differentiable.defjvp(push_forward, symbolic_zeros=True)
     return differentiable(leaves)
+
+
+def _without_thin_collisions(scene: DeviceScene, fixed: Medium | None) -> DeviceScene:
+    """Return the scene with the tables of `fixed`, which do not vary, where light collides in thin voxels.
+
+    Their derivatives are those of `add_tangents`.
+    """
+    medium = scene.medium
+    assert medium is not None
+    assert fixed is not None
+
+    def table(values: Array | None, fixed_values: Array | None) -> Array | None:
+        if values is None or fixed_values is None:
+            return None
+        return jnp.where(fixed.is_thin(fixed_values), fixed_values, values)
+
+    collisions = table(medium.leaf, fixed.leaf), table(medium.bark, fixed.bark)
+    return dataclasses.replace(scene, medium=dataclasses.replace(medium, collisions=collisions))
 
 
 def _varying(leaves: list[Array], tangents: list[Any]) -> list[int]:

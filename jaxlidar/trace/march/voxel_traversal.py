@@ -38,8 +38,7 @@ MAX_PADDED_VOXELS = 1 << 17
 STEPS_PER_CHECK = 8
 
 # A voxel is thin if the map would have less than this optical depth, straight down, with its extinction
-# throughout. Along a flight, the collisions that derivatives place (`trace.march.thin_voxels`) are then more
-# than those of photons.
+# throughout. Fewer photons then collide in it than derivatives place there (`trace.march.thin_voxels`).
 _THIN = 0.2
 # First voxel, and one past the last, along each axis.
 VoxelBox = tuple[tuple[Int[Array, ""], ...], tuple[Int[Array, ""], ...]]
@@ -78,7 +77,8 @@ class Medium(eqx.Module):
     - `angle_tables`, `leaf_angles`: of leaves that are not spherically oriented, else None.
     - `leaf_phase`, `bark_phase`: phase functions that take the place of facets, else None.
     - `periodic`: True if the map repeats along x and y.
-    - `thin_collide`: False where collisions in thin voxels have no derivative by extinction. Default True.
+    - `collisions`: tables of leaf and bark for where light collides, equal to the others but for their
+      derivatives. Default None: the same.
     """
 
     leaf: Float[Array, "cells"] | None
@@ -93,7 +93,7 @@ class Medium(eqx.Module):
     counts: Int[Array, "3"]
     shape: tuple[int, int, int] = eqx.field(static=True)
     periodic: bool = eqx.field(static=True)
-    thin_collide: bool = eqx.field(static=True, default=True)
+    collisions: tuple[Float[Array, "cells"] | None, Float[Array, "cells"] | None] | None = None
 
     def is_thin(self, k: Scalar) -> Bool[Array, "*s"]:
         """Return True for voxels of the extinction `k`, 1/m, where few photons collide, or none."""
@@ -101,20 +101,16 @@ class Medium(eqx.Module):
 
     def leaf_extinction(self, cell: Int[Array, "*s"], w: Vec, *, of_collision: bool = False) -> Scalar:
         """Extinction coefficient of leaf for light along `w`, 1/m: 2 G(w) times that at G = 1/2."""
-        assert self.leaf is not None
-        k = _gather(self.leaf, cell)
-        if of_collision:
-            k = self._of_collision(k)
+        leaf = self.collisions[0] if of_collision and self.collisions is not None else self.leaf
+        assert leaf is not None
+        k = _gather(leaf, cell)
         return k if self.angle_tables is None else k * (2.0 * self.angle_tables.projection_at(w))
 
     def bark_extinction(self, cell: Int[Array, "*s"], *, of_collision: bool = False) -> Scalar:
         """Extinction coefficient of bark, 1/m."""
-        assert self.bark is not None
-        k = _gather(self.bark, cell)
-        return self._of_collision(k) if of_collision else k
-
-    def _of_collision(self, k: Scalar) -> Scalar:
-        return k if self.thin_collide else jnp.where(self.is_thin(k), lax.stop_gradient(k), k)
+        bark = self.collisions[1] if of_collision and self.collisions is not None else self.bark
+        assert bark is not None
+        return _gather(bark, cell)
 
     def extinction(self, cell: Int[Array, "*s"], w: Vec) -> Scalar:
         """Extinction coefficient of leaf and bark together, 1/m."""

@@ -25,8 +25,8 @@ extinction move positions, path lengths and densities continuously, so that the 
 derivative is the derivative of the expected value. Flights that land on a surface are the exception: their
 landing points move with voxel columns and terrain cells, and their directions with these
 (`trace.derivatives.reparametrisation`, with a list of the borders that matter). Photons never collide where
-the extinction coefficient is exactly zero. Derivatives get what would scatter from there by
-`trace.march.thin_voxels`.
+the extinction coefficient is zero, and hardly ever where it is small. Derivatives get what would scatter from
+there by `trace.march.thin_voxels`.
 """
 
 import dataclasses
