@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import ArrayLike, Num
+from jaxtyping import ArrayLike, Num, UInt8
 
 from jaxlidar._fields.checks import (
     as_numpy,
@@ -50,6 +50,8 @@ _SCAN_ANGLE_STEPS, _MAX_SCAN_ANGLES = (1.0, 0.006), (90.0, 180.0)
 _SECONDS_OF_WEEK = 604_800
 # Longest description of an extra dimension in a LAS file, and its name.
 _MAX_EXTRA_TEXT = 32
+# The record that describes extra bytes, and the largest type of a dimension.
+_EXTRA_BYTES_RECORD, _MAX_EXTRA_TYPE = (b"LASF_Spec", 4), 30
 # Largest number of single precision.
 _LARGEST_SINGLE = float(np.finfo(np.float32).max)
 
@@ -74,10 +76,9 @@ def read_las(path: str | os.PathLike[str], *, scale: float | None = None) -> Poi
 
     **Raises:** FileNotFoundError where there is no such file. ImportError without laspy, or without lazrs
     for LAZ. ValueError, naming the file and the place (for points the record), where it is damaged, cut
-    short, without points, declares more than it can hold, or extra bytes that its points lack, or holds
-    coordinates that are not on Earth; and for
-    coordinates in degrees, geocentric ones, and a coordinate reference system that is not known. ValueError
-    for a scale that is not positive.
+    short, without points, declares more than it can hold or extra bytes that its points lack, or holds
+    coordinates that are not on Earth; and for coordinates in degrees, geocentric ones, and a coordinate
+    reference system that is not known. ValueError for a scale that is not positive.
 
     **Source:** LAS specification 1.4 (ASPRS).
 
@@ -122,7 +123,7 @@ def read_stored_points(
             if not skip_unknown_system:
                 raise
             system = CoordinateSystem()
-        dimensions = header.extra_dimensions(path, file)
+        declared = header.record(file, *_EXTRA_BYTES_RECORD) or b""
         if header.laszip is None:
             file.seek(header.start)
             content = file.read(header.points * header.point_size)
@@ -142,6 +143,7 @@ def read_stored_points(
     withheld = np.asarray(cloud.withheld).astype(bool) & ~noise
     selected = ~(noise | withheld)
     records = np.frombuffer(content, np.uint8).reshape(len(cloud), header.point_size)
+    extra = _extra_numbers(path, declared, records, header.point_size - header.extra_bytes)
     points = PointCloud(
         position[selected],
         classes[selected],
@@ -152,7 +154,7 @@ def read_stored_points(
         scan_angle=scan_angles(cloud)[selected],
         gps_time=_gps_time(cloud, selected),
         source=np.asarray(cloud["point_source_id"]).astype(int)[selected],
-        extra={dimension.name: dimension.values(records)[selected] for dimension in dimensions},
+        extra={name: values[selected] for name, values in extra.items()},
     )
     return points, system
 
@@ -182,6 +184,46 @@ def _gps_time(cloud: Any, selected: np.ndarray) -> np.ndarray | None:
     if "gps_time" not in cloud.point_format.dimension_names:
         return None
     return np.asarray(cloud["gps_time"], float)[selected]
+
+
+def _extra_numbers(
+    path: Path, declared: bytes, records: UInt8[np.ndarray, "n bytes"], start: int
+) -> dict[str, Num[np.ndarray, "n *components"]]:
+    """Return the extra bytes of point records as numbers by name, without those that have no type.
+
+    **Arguments:** `declared`: the record that describes them. `start`: their first byte in a point record.
+
+    **Raises:** ValueError, naming the file and the dimension, for declarations that make no sense.
+    """
+    dimension_type = import_laspy("reading LAS").vlrs.known.ExtraBytesStruct
+    size, location = dimension_type.size(), f"{path}: header: extra bytes"
+    if len(declared) % size:
+        raise ValueError(f"{location}: a record of {len(declared)} bytes is no multiple of {size}")
+    numbers, point_size = {}, records.shape[1]
+    for first in range(0, len(declared), size):
+        dimension = dimension_type.from_buffer_copy(declared, first)
+        name, kind = dimension.name.decode(errors="replace"), dimension.data_type
+        if kind > _MAX_EXTRA_TYPE:
+            raise ValueError(f"{location}: {name!r} has type {kind}; admissible is [0, {_MAX_EXTRA_TYPE}]")
+        dtype = dimension.dtype()
+        end = start + dtype.itemsize
+        if end > point_size:
+            raise ValueError(
+                f"{location}: {name!r} ends at byte {end} of point records, which have {point_size}"
+            )
+        if name in numbers:
+            raise ValueError(f"{location}: two dimensions have the name {name!r}")
+        if kind:
+            values = counts = np.ascontiguousarray(records[:, start:end]).view(dtype.base)
+            if dimension.scale is not None:
+                values = values * np.array(dimension.scale)
+            if dimension.offset is not None:
+                values = values + np.array(dimension.offset)
+            if dimension.no_data is not None:
+                values = np.where(counts == dimension.no_data, np.nan, values.astype(float))
+            numbers[name] = values if dtype.shape else values[:, 0]
+        start = end
+    return numbers
 
 
 def import_laspy(purpose: str) -> Any:
@@ -232,8 +274,8 @@ def write_las(
     - `scan_angle`: (n,) degrees from -180 to 180, rounded to 0.006. Default None: 0.
     - `point_source`: (n,) whole numbers from 0 to 65535, such as those of flight lines. Default None: 0.
     - `extra`: further numbers by name: (description, (n,) values), written in single precision as extra
-      bytes. Names and descriptions have at most 32 bytes, and names are none that LAS points have. Default
-      None: none.
+      bytes. Names and descriptions have at most 32 bytes, and a name must not be that of a field of LAS
+      points. Default None: none.
     - `crs`: the coordinate reference system of `position`, in metres, such as "EPSG:32633". Default None: not
       known. This needs pyproj.
 

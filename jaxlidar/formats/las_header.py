@@ -13,9 +13,6 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import BinaryIO, NamedTuple
 
-import numpy as np
-from jaxtyping import Float, Num, UInt8
-
 from jaxlidar._fields.crs import CoordinateSystem
 from jaxlidar.formats.checks import check_unpacked_size
 from jaxlidar.formats.coordinates import declared_system
@@ -29,13 +26,6 @@ _HEADER_SIZES = {0: 227, 1: 227, 2: 227, 3: 235, 4: 375, 5: 393}
 # The header of a variable length record (user, number, length), and that of an extended one.
 _RECORD_HEADER, _EXTENDED_RECORD_HEADER = struct.Struct("<2x16sHH32x"), struct.Struct("<2x16sHQ32x")
 _LASZIP_RECORD = (b"laszip encoded", 22204)
-# The record that describes extra bytes, and its entry for each dimension: type, options, name, number for no
-# data, scales and offsets.
-_EXTRA_BYTES_RECORD, _EXTRA_DIMENSION = (b"LASF_Spec", 4), struct.Struct("<2xBB32s4x24s48x24s24s32x")
-# Types of extra dimensions from 1 on; the next ten are pairs of them, and the last ten triples.
-_EXTRA_TYPES = ("u1", "i1", "u2", "i2", "u4", "i4", "u8", "i8", "f4", "f8")
-# Bits of the options of an extra dimension.
-_HAS_NO_DATA, _HAS_SCALE, _HAS_OFFSET = 1, 8, 16
 # The user of the records that declare the coordinate reference system.
 PROJECTION_USER = b"LASF_Projection"
 # The bit of the point format that says that points are compressed, by LAZ and not by the specification.
@@ -49,37 +39,6 @@ ITEMS = {
 ITEM_SIZES = {6: 20, 7: 8, 8: 6, 9: 29, 10: 30, 11: 6, 12: 8, 13: 29}
 # Admissible units of length in which coordinates are counted.
 _SCALES = (1e-9, 1e3)
-
-
-class ExtraDimension(NamedTuple):
-    """A number, or two or three, that point records have as extra bytes.
-
-    - `name`: of the dimension. - `dtype`: of the numbers, with their shape. - `start`: its first byte in a
-      point record.
-    - `scale`, `offset`, and `no_data`, the counts that stand for no data: (components,), or None where the
-      file declares none.
-    """
-
-    name: str
-    dtype: np.dtype
-    start: int
-    scale: Float[np.ndarray, " components"] | None
-    offset: Float[np.ndarray, " components"] | None
-    no_data: Num[np.ndarray, " components"] | None
-
-    def values(self, records: UInt8[np.ndarray, "n bytes"]) -> Num[np.ndarray, "n *components"]:
-        """Return the numbers of point records; see `PointCloud.extra`."""
-        end = self.start + self.dtype.itemsize
-        counts = np.ascontiguousarray(records[:, self.start : end]).view(self.dtype.base)
-        values = counts
-        if self.scale is not None or self.offset is not None or self.no_data is not None:
-            values = counts.astype(float)
-        values = values if self.scale is None else values * self.scale
-        values = values if self.offset is None else values + self.offset
-        if self.no_data is not None:
-            # Single precision rounds what the header has in double.
-            values = np.where(counts == self.no_data.astype(counts.dtype), np.nan, values)
-        return values if self.dtype.shape else values[:, 0]
 
 
 class VariableRecord(NamedTuple):
@@ -178,50 +137,6 @@ class LasHeader:
     def extra_bytes(self) -> int:
         """Bytes of a point record beyond those that its format names."""
         return self.point_size - sum(ITEM_SIZES[item] for item in ITEMS[self.point_format])
-
-    def extra_dimensions(self, path: Path, file: BinaryIO) -> list[ExtraDimension]:
-        """Return what the file declares its extra bytes to be, without those that have no type.
-
-        **Raises:** ValueError, naming the file and the dimension, for declarations that make no sense.
-        """
-        content = self.record(file, *_EXTRA_BYTES_RECORD) or b""
-        location = f"{path}: header: extra bytes"
-        if len(content) % _EXTRA_DIMENSION.size:
-            raise ValueError(
-                f"{location}: a record of {len(content)} bytes is no multiple of {_EXTRA_DIMENSION.size}"
-            )
-        dimensions: dict[str, ExtraDimension] = {}
-        start = self.point_size - self.extra_bytes
-        for kind, options, raw_name, no_data, scale, offset in _EXTRA_DIMENSION.iter_unpack(content):
-            name = raw_name.split(b"\0")[0].decode(errors="replace")
-            if kind > 3 * len(_EXTRA_TYPES):
-                raise ValueError(f"{location}: {name!r} has type {kind}; admissible is [0, 30]")
-            # Without a type, the options are a number of bytes.
-            components, base = divmod(kind - 1, len(_EXTRA_TYPES))
-            shape = (components + 1,) if components > 0 else ()
-            dtype = np.dtype((f"<{_EXTRA_TYPES[base]}", shape)) if kind else np.dtype(f"V{options}")
-            end = start + dtype.itemsize
-            if end > self.point_size:
-                raise ValueError(
-                    f"{location}: {name!r} ends at byte {end} of point records, which have {self.point_size}"
-                )
-            if name in dimensions:
-                raise ValueError(f"{location}: two dimensions have the name {name!r}")
-            if kind:
-                # The specification stores numbers for no data in 8 bytes each.
-                widest = np.dtype(f"<{dtype.base.kind}8")
-                declared = (
-                    (scale, "<f8", _HAS_SCALE),
-                    (offset, "<f8", _HAS_OFFSET),
-                    (no_data, widest, _HAS_NO_DATA),
-                )
-                numbers = (
-                    np.frombuffer(raw, kind_of_number)[: components + 1] if options & bit else None
-                    for raw, kind_of_number, bit in declared
-                )
-                dimensions[name] = ExtraDimension(name, dtype, start, *numbers)
-            start = end
-        return list(dimensions.values())
 
 
 def read_header(path: Path, file: BinaryIO) -> LasHeader:

@@ -269,6 +269,13 @@ def test_extra_bytes_are_read_as_declared(tmp_path, suffix):
     np.testing.assert_array_equal(extra["code"], [7, 65535])
     np.testing.assert_allclose(extra["range"], [7.5, np.nan])
     np.testing.assert_array_equal(extra["normal"], [[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]])
+    # In single precision, too, a number stands for no data.
+    las = laspy.create(point_format=6, file_version="1.4")
+    las.add_extra_dim(laspy.ExtraBytesParams("rough", "f4", "", no_data=[-9999.9]))
+    las.x, las.y, las.z = np.arange(6.0).reshape(3, 2)
+    las.rough = [-9999.9, 1.5]
+    las.write(path)
+    np.testing.assert_array_equal(read_las(path).extra["rough"], [np.nan, 1.5])
     # Bytes without a type are no number.
     path = write_with_extra_bytes(path, untyped=(2, b"\0\2"))
     assert list(read_las(path).extra) == ["range", "normal"]
