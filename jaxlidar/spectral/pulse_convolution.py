@@ -49,7 +49,8 @@ class PulseConvolution(eqx.Module):
 
     def matrix(self) -> Float[Array, "fine samples"]:
         """Return the fraction of a return in fine bin i that each sample receives."""
-        samples, bins = np.arange(self.n_samples)[None, :], np.arange(self.n_bins)[:, None]
+        # Indices are computed by the program: tables of NumPy would be constants of megabytes in it.
+        samples, bins = jnp.arange(self.n_samples)[None, :], jnp.arange(self.n_bins)[:, None]
         # Optimisation barriers: fused into the gather, the pulse would be computed again for every element;
         # and the matrix for every product, in place of once for all shots of a survey.
         return barrier(barrier(self.fractions)[samples * self.bins_per_sample - bins - self.first_offset])
@@ -87,10 +88,10 @@ class PulseConvolution(eqx.Module):
     def _tile_matrices(self, n_tile: int) -> Float[Array, "block 2 tile"]:
         """Return the fraction of each bin of the two blocks of a tile that each of its samples receives."""
         block, width = n_tile * self.bins_per_sample, self.fractions.size
-        bins = np.arange(block)[:, None, None] + block * np.arange(2)[None, :, None]
-        index = np.arange(n_tile)[None, None, :] * self.bins_per_sample - bins + width - 1
+        bins = jnp.arange(block)[:, None, None] + block * jnp.arange(2)[None, :, None]
+        index = jnp.arange(n_tile)[None, None, :] * self.bins_per_sample - bins + width - 1
         in_band = (index >= 0) & (index < width)
-        fractions = barrier(self.fractions)[np.clip(index, 0, width - 1)]
+        fractions = barrier(self.fractions)[jnp.clip(index, 0, width - 1)]
         # Optimisation barriers as in `matrix`.
         return barrier(jnp.where(in_band, fractions, 0.0))
 
