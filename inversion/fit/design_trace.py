@@ -121,7 +121,7 @@ def trace_for_design(
     setters = tuple(
         u.setter._replace(dependence="geometric") if u.setter.changes_response else u.setter for u in unknowns
     )
-    inputs = SimulationInputs(lidar, scene, plan, setters, tangents_per_pass=1)
+    inputs = SimulationInputs(lidar, scene, plan, setters, tangents_per_pass=1).with_room()
     values = tuple(u.start for u in unknowns)
     divergences = [lidar.divergence] if nodes is None else nodes.divergences
     priors, start = fixed_priors(unknowns), flat_start(unknowns)

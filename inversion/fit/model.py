@@ -40,7 +40,14 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from inversion.fit.planning import N_BATCHES
-from inversion.fit.unknowns import BoundUnknown, Dependence, Setter, set_lidar_values, set_values
+from inversion.fit.unknowns import (
+    BoundUnknown,
+    Dependence,
+    Setter,
+    extinction_arrays,
+    set_lidar_values,
+    set_values,
+)
 from jaxlidar import (
     Lidar,
     Plan,
@@ -59,6 +66,7 @@ from jaxlidar.spectral.apply_optics import derivatives_to_samples, make_waveform
 from jaxlidar.trace.derivatives.extinction_slopes import ExtinctionSlopes
 from jaxlidar.trace.derivatives.score_functions import make_slopes
 from jaxlidar.trace.device_scene import build_device_scene
+from jaxlidar.trace.march.voxel_traversal import with_room
 from jaxlidar.trace.response import Response, trace_with_scores
 
 Values = tuple[Array, ...]
@@ -202,6 +210,7 @@ class SimulationInputs(eqx.Module):
 
     - `tangents_per_pass`: geometric columns of the Jacobian that are pushed through the trace together.
     - `columns_per_voxel`: the most columns that move the extinction of one voxel; 0 without scores.
+    - `voxel_counts`: numbers of voxels, where the scene's map has room for more (`with_room`); else None.
     """
 
     lidar: Lidar
@@ -210,6 +219,23 @@ class SimulationInputs(eqx.Module):
     setters: tuple[Setter, ...] = eqx.field(static=True)
     tangents_per_pass: int = eqx.field(static=True)
     columns_per_voxel: int = eqx.field(static=True, default=0)
+    voxel_counts: Int[Array | np.ndarray, "3"] | None = None
+
+    def with_room(self) -> "SimulationInputs":
+        """Return the inputs with a voxel map of a size bucket, whose programs maps of several shapes share.
+
+        Unknowns may stand for the map itself: then it stays as it is.
+        """
+        if self.scene.canopy is None:
+            return self
+        extinction = extinction_arrays(self.scene)
+        if any(s.apply is not None or (not s.of_lidar and s.array_index in extinction) for s in self.setters):
+            return self
+        voxels = with_room(self.scene.canopy.voxels)
+        # The numbers of voxels join the scene after the values, whose setters count the arrays before them.
+        tables = dataclasses.replace(voxels, _counts=None)
+        scene = eqx.tree_at(lambda s: s.canopy.voxels, self.scene, tables)
+        return dataclasses.replace(self, scene=scene, voxel_counts=voxels.counts)
 
     def setup(self, values: Values) -> Setup:
         """Return the setup with these values."""
@@ -222,7 +248,11 @@ class SimulationInputs(eqx.Module):
 
     def _with_values(self, values: Values) -> tuple[Lidar, Scene]:
         lidar = set_lidar_values(self.lidar, self.setters, values)
-        return lidar, set_values(self.scene, self.setters, values)
+        scene = set_values(self.scene, self.setters, values)
+        if self.voxel_counts is not None:
+            voxels = dataclasses.replace(scene.canopy.voxels, _counts=self.voxel_counts)
+            scene = eqx.tree_at(lambda s: s.canopy.voxels, scene, voxels)
+        return lidar, scene
 
     def as_function_of(
         self, dependence: Dependence, values: Values
@@ -459,9 +489,10 @@ class ForwardModel:
             u.start.size for u, setter in zip(unknowns, methods.setters) if setter.dependence == "geometric"
         )
         per_pass = tangents_per_pass(plan, n_geometric, methods.score_bytes)
+        self.scene = scene
         self.inputs = SimulationInputs(
             lidar, scene, plan, methods.setters, per_pass, methods.columns_per_voxel
-        )
+        ).with_room()
         self.shapes = [u.start.shape for u in unknowns]
         self.dtypes = [u.start.dtype for u in unknowns]
         self.sizes = [u.start.size for u in unknowns]
@@ -483,7 +514,7 @@ class ForwardModel:
 
     def scene_at(self, flat: Float[np.ndarray, " columns"]) -> Scene:
         """Return the scene with these values."""
-        return set_values(self.inputs.scene, self.inputs.setters, self.values(flat))
+        return set_values(self.scene, self.inputs.setters, self.values(flat))
 
     def __call__(
         self, flat: Float[np.ndarray, " columns"], *, with_batches: bool = False, pilot: bool = False

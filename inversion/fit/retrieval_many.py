@@ -304,8 +304,10 @@ class LockstepModel:
     """The simulated waveforms of all running fits: one compiled call for each thread's group."""
 
     def __init__(self, problem: BoundProblem, groups: LockstepGroups, key: PRNGKeyArray):
-        self.lidars, self.scenes, self.groups = problem.lidars, problem.scenes, groups
-        self.model = ForwardModel(self.lidars[0], self.scenes[0], problem.plan, problem.unknowns[0], key)
+        self.lidars, self.groups = problem.lidars, groups
+        self.model = ForwardModel(self.lidars[0], problem.scenes[0], problem.plan, problem.unknowns[0], key)
+        inputs = self.model.inputs
+        self.scenes = [dataclasses.replace(inputs, scene=scene).with_room().scene for scene in problem.scenes]
 
     def __call__(self, requests: Mapping[int, EvaluationRequest]) -> dict[int, Evaluation]:
         """Evaluate the requests of fits, by the index of their footprint."""

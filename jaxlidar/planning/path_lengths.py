@@ -162,7 +162,7 @@ class PathLengths:
         self.reaches_sensor: Any = False
         if scene.canopy is not None:
             v = scene.canopy.voxels
-            self.size, self.shape = fixed_array(v.voxel_size, xp), np.array(v.shape, float)
+            self.size, self.shape = fixed_array(v.voxel_size, xp), v.counts.astype(float)
         if self.from_sensor:
             self._from_sensors(shots)
             return
@@ -360,7 +360,7 @@ class PathLengths:
     @property
     def longest_affordable_flight(self) -> Any:
         """Length, m, of the longest flight through a periodic canopy that crosses at most `MAX_VOXELS`."""
-        length = max(int(MAX_VOXELS - self.shape[2]), 1) / self.xp.sum(1.0 / self.size[:2])
+        length = self.xp.maximum(MAX_VOXELS - self.shape[2], 1) / self.xp.sum(1.0 / self.size[:2])
         return float(length) if self.xp is np else length
 
     def max_faces(self, path: Any) -> Any:
@@ -368,7 +368,8 @@ class PathLengths:
         if self.scene.canopy is None:
             return 0
         if self.scene.canopy.sides == "open":
-            return int(self.shape.sum()) + 3
+            count = self.shape.sum() + 3
+            return int(count) if self.xp is np else count
         return self.voxels_along(self.longest_flight(path))
 
     def voxels_along(self, flight: Any) -> Any:

@@ -197,7 +197,7 @@ class Scene(eqx.Module):
         """Periods along x and y, m, of a canopy or terrain with periodic sides; None without."""
         if self.canopy is not None and self.canopy.sides == "periodic":
             voxels = self.canopy.voxels
-            return voxels.voxel_size[:2] * np.array(voxels.shape[:2], float)
+            return voxels.voxel_size[:2] * voxels.counts[:2].astype(float)
         if isinstance(self.ground, Terrain) and self.ground.sides == "periodic":
             return self.ground.spacing * np.array(self.ground.heights.shape, float)
         # Meshes know the period of what a simulation leaves out.
@@ -254,7 +254,7 @@ def check_periods(canopy: Canopy, terrain: Terrain) -> None:
         raise ValueError(
             "the canopy has sides = 'periodic', the terrain 'open'; admissible for both is 'periodic'"
         )
-    canopy_period, terrain_period = size[:2] * canopy.voxels.shape[:2], spacing * terrain.heights.shape
+    canopy_period, terrain_period = size[:2] * canopy.voxels.counts[:2], spacing * terrain.heights.shape
     if not np.allclose(canopy_period, terrain_period, rtol=1e-5, atol=0.0):
         raise ValueError(
             f"the canopy repeats after {canopy_period[0]:g} m and {canopy_period[1]:g} m, the terrain after "

@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, ArrayLike, Float, Int
 
 from jaxlidar._fields.checks import (
     Magnitude,
@@ -103,6 +103,9 @@ class VoxelMap(eqx.Module):
     origin: Float[Array | np.ndarray, "3"] = quantity(unit="m", converter=coordinates(3))
     leaf_angles: LeafAngles | None = None
     crs: str | None = eqx.field(static=True, converter=crs_name, default=None)
+    # Voxels along x, y and z, where the tables have room for more: in programs that maps of several shapes
+    # share (`trace.march.voxel_traversal.with_room`). None: all of the tables.
+    _counts: Int[Array | np.ndarray, "3"] | None = None
 
     def __str__(self) -> str:
         return object_text(self)
@@ -130,9 +133,14 @@ class VoxelMap(eqx.Module):
         return nx, ny, nz
 
     @property
+    def counts(self) -> Int[Array | np.ndarray, "3"]:
+        """(3,) numbers of voxels along x, y and z."""
+        return np.array(self.shape) if self._counts is None else self._counts
+
+    @property
     def top(self) -> Float[Array, "3"]:
         """(3,) upper north-east corner in m."""
-        return jnp.asarray(self.origin + self.voxel_size * np.asarray(self.shape, float))
+        return jnp.asarray(self.origin + self.voxel_size * self.counts.astype(float))
 
     @staticmethod
     def from_extinction(

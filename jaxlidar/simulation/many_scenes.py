@@ -8,6 +8,7 @@ import dataclasses
 import os
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -24,6 +25,7 @@ from jaxlidar.scenes.scene import Scene, check_kinds
 from jaxlidar.sensors.lidar import Lidar
 from jaxlidar.simulation.one_scene import simulate
 from jaxlidar.spectral.waveform import Waveform
+from jaxlidar.trace.march.voxel_traversal import with_room
 
 # Scenes of one chunk at most: more gain nothing, as their rays no longer stay in the cache of a core.
 MAX_CHUNK = 128
@@ -158,6 +160,9 @@ def _simulate_in_chunks(
     def simulate_rows(start: int) -> Waveform:
         rows = np.minimum(np.arange(start, start + size), number - 1)
         chunk_scenes = jax.tree.map(lambda a: a[rows], host_scenes)
+        if chunk_scenes.canopy is not None:
+            voxels = with_room(chunk_scenes.canopy.voxels)
+            chunk_scenes = eqx.tree_at(lambda s: s.canopy.voxels, chunk_scenes, voxels)
         wave = _compiled_chunk(lidar, chunk_scenes, plan, key, rows.astype(np.int32))
         wave = jax.tree.map(lambda a: np.asarray(a)[: number - start], wave)
         if refuses:

@@ -22,6 +22,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxlidar._fields.checks import is_traced
 from jaxlidar._jax.mesh_axes import vary_together
 from jaxlidar._jax.one_function import barrier, one_function
 from jaxlidar._jax.vmapped_loops import any_problem
@@ -30,6 +31,7 @@ from jaxlidar.optics.leaf_angles import ANGLE_NODES, LeafAngles
 from jaxlidar.optics.phase import AbstractPhase
 from jaxlidar.planning.size_buckets import size_bucket
 from jaxlidar.scenes.canopy import Canopy
+from jaxlidar.scenes.voxels import VoxelMap
 from jaxlidar.trace.derivatives.extinction_slopes import ExtinctionSlopes
 
 # Maps of more voxels than this are laid out without room to spare: it would cost more than compiling again.
@@ -150,14 +152,9 @@ def _gather(table: Float[Array, "cells"], cell: Int[Array, "*s"]) -> Scalar:
 
 def make_medium(canopy: Canopy, aim: Float[Array, "3"]) -> Medium:
     """Lay the voxel map of a canopy out for tracing."""
-    voxels = canopy.voxels
-    shape = _padded_shape(voxels.shape)
-
-    def laid_out(table: Float[Array, "nx ny nz"]) -> Float[Array, "cells"]:
-        return jnp.pad(table, [(0, padded - n) for padded, n in zip(shape, voxels.shape)]).reshape(-1)
-
-    leaf = None if voxels.leaf is None else laid_out(voxels.leaf)
-    bark = None if voxels.bark is None else laid_out(voxels.bark)
+    voxels = with_room(canopy.voxels)
+    leaf = None if voxels.leaf is None else jnp.ravel(voxels.leaf)
+    bark = None if voxels.bark is None else jnp.ravel(voxels.bark)
     angle_tables = None
     if voxels.leaf_angles is not None and leaf is not None:
         angle_tables = AngleTables(*voxels.leaf_angles.tables())
@@ -171,10 +168,28 @@ def make_medium(canopy: Canopy, aim: Float[Array, "3"]) -> Medium:
         leaf_angles=voxels.leaf_angles if angle_tables is not None else None,
         leaf_phase=None if leaf is None else canopy.leaf_phase,
         bark_phase=None if bark is None else canopy.bark_phase,
-        counts=jnp.asarray(voxels.shape, jnp.int32),
-        shape=shape,
+        counts=jnp.asarray(voxels.counts, jnp.int32),
+        shape=voxels.shape,
         periodic=canopy.sides == "periodic",
     )
+
+
+def with_room(voxels: VoxelMap) -> VoxelMap:
+    """Return the map, or stack of maps, with tables of a size bucket, which maps of several shapes share."""
+    if voxels._counts is not None:
+        return voxels
+    *stack, nx, ny, nz = (voxels.bark if voxels.leaf is None else voxels.leaf).shape
+    room = [(0, 0)] * len(stack) + [(0, n - m) for n, m in zip(_padded_shape((nx, ny, nz)), (nx, ny, nz))]
+
+    def padded(table: Array | np.ndarray | None) -> Array | np.ndarray | None:
+        if table is None:
+            return None
+        # By NumPy, where nothing is traced: JAX would compile a program for each shape.
+        return (jnp if is_traced(table) else np).pad(table, room)
+
+    counts = np.broadcast_to(np.array([nx, ny, nz], np.int32), (*stack, 3))
+    tables = (padded(voxels.leaf), padded(voxels.bark), counts)
+    return eqx.tree_at(lambda v: (v.leaf, v.bark, v._counts), voxels, tables, is_leaf=lambda x: x is None)
 
 
 def _padded_shape(shape: tuple[int, ...]) -> tuple[int, int, int]:
