@@ -15,7 +15,7 @@ from jaxlidar._fields.crs import CoordinateSystem, system_of_crs, system_of_name
 from jaxlidar.formats.checks import MAX_COORDINATE, FileWarning, check_unpacked_size, existing_file
 from jaxlidar.formats.coordinates import MAX_ELEVATION, MIN_ELEVATION, open_raster
 from jaxlidar.formats.text import parse_integer, parse_number, read_lines
-from jaxlidar.formats.units import unit_length
+from jaxlidar.formats.units import unit_size
 from jaxlidar.optics.laws import AbstractLaw, Lambertian
 from jaxlidar.scenes.terrain import Terrain
 
@@ -208,7 +208,7 @@ def _height_unit(path: Path, unit: str | None, system: CoordinateSystem, is_argu
     **Raises:** ValueError where these differ, and where x and y have another unit than the metre and heights
     have none.
     """
-    own = unit_length(f"{path}: band 1", unit)
+    own = unit_size("length", f"{path}: band 1", unit)
     if own is not None and system.vertical is not None and not units_agree(own, system.vertical):
         raise ValueError(
             f"{path}: the unit of heights is {unit!r} in the band, but {system.vertical:g} m in {system.name}"

@@ -184,18 +184,15 @@ def _shot_numbers(path: Path, cells: dict[int, str]) -> Int[np.ndarray, " n"]:
 def _places_of_product(path: Path, crs: str) -> Places:
     """Read the places of shots of levels 1B or 2A. **Raises:** as `read_places`."""
     shot_numbers, beams, places, locations, remarks = [], [], [], [], []
-    with open_hdf5(path) as file:
-        for beam in file.groups("BEAM", _PRODUCT):
+    with open_hdf5(path, _PRODUCT) as file:
+        for beam in file.groups("BEAM"):
             pairs = [pair for pair in _PLACES_OF_PRODUCTS if all(file.has(f"{beam}/{n}") for n in pair)]
             if not pairs:
                 raise ValueError(
                     f"{file.location(beam)}: no longitude and latitude; it is no {_PRODUCT} product"
                 )
-            axes = [
-                file.in_unit(f"{beam}/{n}", file.numbers(f"{beam}/{n}", _PRODUCT), "degrees")
-                for n in pairs[0]
-            ]
-            numbers, location = file.read(f"{beam}/shot_number", _PRODUCT), file.location(beam)
+            axes = [file.numbers(f"{beam}/{n}", "degrees") for n in pairs[0]]
+            numbers, location = file.read(f"{beam}/shot_number"), file.location(beam)
             if not axes[0].size == axes[1].size == numbers.size:
                 raise ValueError(
                     f"{location}: {numbers.size} shot numbers belong to {axes[0].size} longitudes and "

@@ -46,7 +46,6 @@ from jaxlidar.formats.coordinates import check_elevations
 from jaxlidar.formats.hdf5 import ProductFile, open_hdf5
 from jaxlidar.formats.noise import above_pedestal
 
-_PRODUCT = "GEDI L1B"
 # Groups of beams: the number of the laser's channel, and True for a beam with the full power of its laser.
 BEAMS = {
     "BEAM0000": (0, False),
@@ -252,8 +251,8 @@ def _read_rows(
 
     **Arguments:** `counts_skipped`: have a remark on each beam with shots that are not complete.
     """
-    with open_hdf5(path) as file:
-        beams, beam_errors = _open_beams(file, file.groups("BEAM", _PRODUCT))
+    with open_hdf5(path, "GEDI L1B") as file:
+        beams, beam_errors = _open_beams(file, file.groups("BEAM"))
         selected = _select(file.path, beams, requested)
         # By beam, so that the samples of neighbouring shots are read together.
         indices_by_beam: dict[_Beam, set[int]] = {}
@@ -514,31 +513,12 @@ class _Beam:
     @functools.cached_property
     def shot_number(self) -> np.ndarray:
         """(shots,) unique numbers of the product."""
-        numbers = self._read("shot_number")
-        if numbers.dtype.kind not in "iu":
-            raise ValueError(
-                f"{self.location('shot_number')}: type {numbers.dtype} where whole numbers belong"
-            )
-        return numbers
+        return self.file.integers(f"{self.name}/shot_number")
 
     @functools.cached_property
     def _per_shot(self) -> dict[str, np.ndarray]:
         """Numbers of shots by field, in double precision; NaN where they are missing."""
-        for field in _PER_SHOT:
-            self._check_shape(field)
-        return {field: self._in_units(field) for field in _PER_SHOT}
-
-    def _check_shape(self, field: str) -> None:
-        shape = self._dataset(field).shape
-        if shape != (self.size,):
-            raise ValueError(
-                f"{self.location(field)}: shape {shape}, but shot_number has the shape {(self.size,)}"
-            )
-
-    def _in_units(self, field: str) -> np.ndarray:
-        """Return the numbers of all shots in the unit of `_UNITS`, by the dataset's attribute `units`."""
-        values = self._read_numbers(field)
-        return self.file.in_unit(f"{self.name}/{field}", values, _UNITS.get(field, ""))
+        return {field: self._numbers(field) for field in _PER_SHOT}
 
     @functools.cached_property
     def _flags(self) -> dict[str, np.ndarray]:
@@ -548,8 +528,7 @@ class _Beam:
             if not self._has(field):
                 continue
             try:
-                self._check_shape(field)
-                values = self._read_numbers(field)
+                values = self._numbers(field)
             except ValueError as error:
                 self.remarks.append(f"{error}: the flag is left out")
                 continue
@@ -571,8 +550,7 @@ class _Beam:
             if not self._has(field):
                 continue
             try:
-                self._check_shape(field)
-                columns[name] = self._in_units(field)
+                columns[name] = self._numbers(field)
             except ValueError as error:
                 self.remarks.append(f"{error}: it is left out")
         return columns
@@ -580,10 +558,7 @@ class _Beam:
     def _start_indices(self, kind: str) -> np.ndarray:
         """Return the start indices of all shots, from 1; NaN where they are missing."""
         field = f"{kind}_sample_start_index"
-        if not self._has(field):
-            return np.full(self.size, np.nan)
-        self._check_shape(field)
-        return self._read_numbers(field)
+        return self._numbers(field) if self._has(field) else np.full(self.size, np.nan)
 
     @functools.cached_property
     def _sample_locations(self) -> "dict[str, _SampleLocation]":
@@ -618,15 +593,11 @@ class _Beam:
         return self.file.has(f"{self.name}/{field}")
 
     def _dataset(self, field: str) -> Any:
-        """Return a dataset of numbers in one dimension, all of which are stored in the file."""
-        return self.file.dataset(f"{self.name}/{field}", _PRODUCT)
+        return self.file.dataset(f"{self.name}/{field}")
 
-    def _read(self, field: str) -> np.ndarray:
-        return self.file.read(f"{self.name}/{field}", _PRODUCT)
-
-    def _read_numbers(self, field: str) -> np.ndarray:
-        """Return the numbers of a dataset in double precision; NaN where they have its fill value."""
-        return self.file.numbers(f"{self.name}/{field}", _PRODUCT)
+    def _numbers(self, field: str) -> np.ndarray:
+        """Return the numbers of all shots, in the unit of `_UNITS`; NaN where they are missing."""
+        return self.file.numbers(f"{self.name}/{field}", _UNITS.get(field, ""), shape=(self.size,))
 
 
 class _SampleLocation(NamedTuple):

@@ -15,7 +15,6 @@ from jaxlidar.formats.checks import FileWarning
 from jaxlidar.formats.hdf5 import ProductFile, open_hdf5
 from jaxlidar.formats.tables import Column, ColumnAxis, ShotTable
 
-# The products' -9999 is a fill value also where no attribute says so.
 _FILL = -9999.0
 # Numbers of algorithm setting groups.
 _GROUPS = range(1, 7)
@@ -178,10 +177,11 @@ def _read(
             )
     beams: list[dict[str, Column]] = []
     errors: list[ValueError] = []
-    with open_hdf5(path) as file:
-        for beam in file.groups("BEAM", product):
+    # The products' -9999 is a fill value also where no attribute says so.
+    with open_hdf5(path, product, lambda values: values == _FILL) as file:
+        for beam in file.groups("BEAM"):
             try:
-                beams.append(_read_beam(file, beam, product, fields, needed))
+                beams.append(_read_beam(file, beam, fields, needed))
             except ValueError as error:
                 errors.append(error)
     if not beams:
@@ -200,33 +200,23 @@ def _read(
 
 
 def _read_beam(
-    file: ProductFile, beam: str, product: str, fields: tuple[_Field, ...], needed: tuple[str, ...]
+    file: ProductFile, beam: str, fields: tuple[_Field, ...], needed: tuple[str, ...]
 ) -> dict[str, Column]:
     """Return the columns of one beam. **Raises:** ValueError for a group without what is `needed`."""
-    numbers = file.read(f"{beam}/shot_number", product)
-    if numbers.dtype.kind not in "iu":
-        raise ValueError(
-            f"{file.location(f'{beam}/shot_number')}: type {numbers.dtype} where whole numbers belong"
-        )
+    numbers = file.integers(f"{beam}/shot_number")
     columns = {
         "shot_number": Column(numbers.astype(np.uint64), "", "unique number of the product"),
         "beam": Column(np.full(numbers.size, beam), "", "name of the beam's group"),
     }
     for field in fields:
-        name = next((f"{beam}/{name}" for name in field.datasets if file.has(f"{beam}/{name}")), None)
+        names = [f"{beam}/{name}" for name in field.datasets]
+        name = next(filter(file.has, names), names[0] if field.name in needed else None)
         if name is None:
-            if field.name in needed:
-                raise ValueError(
-                    f"{file.location(f'{beam}/{field.datasets[0]}')}: no such dataset; it is part of a "
-                    f"{product} product"
-                )
             continue
-        values = file.numbers(name, product, 1 if field.levels is None else 2)
+        unit = "s since 2018-01-01" if field.name == "delta_time" else field.unit
+        values = file.numbers(name, unit, ndim=1 if field.levels is None else 2)
         if len(values) != numbers.size:
             raise ValueError(f"{file.location(name)}: {len(values)} rows, shot_number has {numbers.size}")
-        values = np.where(values == _FILL, np.nan, values)
-        unit = "s since 2018-01-01" if field.name == "delta_time" else field.unit
-        values = file.in_unit(name, values, unit)
         columns[field.name] = Column(values, field.unit, field.description, _axis(file, beam, field, values))
     return columns
 
@@ -244,7 +234,7 @@ def _axis(file: ProductFile, beam: str, field: _Field, values: np.ndarray) -> Co
     thickness, name = _LAYER_THICKNESS, f"{beam}/ancillary/dz"
     if file.has(name):
         # One number is in use, however many the file has.
-        stated = file.in_unit(name, file.numbers(name, "GEDI L2B", rows=slice(1)), "m")
+        stated = file.numbers(name, "m", rows=slice(1))
         # Written so that NaN is refused.
         if stated.size == 0 or not 0 < stated[0] <= _MAX_LAYER_THICKNESS:
             raise ValueError(

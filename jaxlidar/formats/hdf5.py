@@ -20,7 +20,7 @@ import io
 import math
 import os
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -30,18 +30,18 @@ from jaxtyping import Float
 from jaxlidar._fields.checks import required_for
 from jaxlidar._fields.crs import units_agree
 from jaxlidar.formats.checks import check_unpacked_size, existing_file, refuse_damage
-from jaxlidar.formats.units import unit_angle, unit_length, unit_time
+from jaxlidar.formats.units import unit_size
 
 # Attributes of numbers that are stored as counts.
 _STORED_AS_COUNTS = {"scale_factor": 1.0, "add_offset": 0.0}
 # Attributes with values that stand for a missing number.
 _FILL_ATTRIBUTES = ("_FillValue", "missing_value")
-# Units of numbers that readers ask for: the function that reads a unit of the kind, and the size.
+# Units of numbers that readers ask for: their kind and size.
 _UNITS = {
-    "m": (unit_length, 1.0),
-    "degrees": (unit_angle, math.pi / 180.0),
-    "rad": (unit_angle, 1.0),
-    "s": (unit_time, 1.0),
+    "m": ("length", 1.0),
+    "degrees": ("angle", math.pi / 180.0),
+    "rad": ("angle", 1.0),
+    "s": ("time", 1.0),
 }
 # Between the unit and the epoch of a time.
 _SINCE = " since "
@@ -55,8 +55,13 @@ _PLAIN_KINDS = "biufS"
 
 
 @contextlib.contextmanager
-def open_hdf5(path: str | os.PathLike[str]) -> Iterator["ProductFile"]:
+def open_hdf5(
+    path: str | os.PathLike[str], product: str, is_fill: Callable[[np.ndarray], np.ndarray] | None = None
+) -> Iterator["ProductFile"]:
     """Open an HDF5 file to read it.
+
+    **Arguments:** `product`: its name, for messages. `is_fill`: tells which numbers stand for missing ones
+    where no attribute says so. Default None: none.
 
     **Raises:** FileNotFoundError where there is no such file, ImportError without h5py, ValueError for a file
     that is not HDF5.
@@ -67,18 +72,18 @@ def open_hdf5(path: str | os.PathLike[str]) -> Iterator["ProductFile"]:
     with contextlib.ExitStack() as stack:
         with refuse_damage(f"{path}: not a readable HDF5 file"):
             file = stack.enter_context(h5py.File(path, "r"))
-        yield ProductFile(path, file, stack)
+        yield ProductFile(path, product, file, stack, is_fill)
 
 
 class ProductFile:
     """An open HDF5 file of a product, whose datasets are checked before they are read.
 
-    - `path`, `file`: the path, and the `h5py.File`.
-    - `stack`: of what is closed with the file.
+    - `path`, `product`, `file`: the path, the name of the product, and the `h5py.File`.
+    - `stack`: of what is closed with the file. `is_fill`: as for `open_hdf5`.
     """
 
-    def __init__(self, path: Path, file: Any, stack: contextlib.ExitStack):
-        self.path, self.file, self._stack = path, file, stack
+    def __init__(self, path: Path, product: str, file: Any, stack: contextlib.ExitStack, is_fill: Any):
+        self.path, self.product, self.file, self._stack, self._is_fill = path, product, file, stack, is_fill
 
     @functools.cached_property
     def _checked_file(self) -> Any:
@@ -93,7 +98,7 @@ class ProductFile:
         """Return the location of a dataset or group, for messages."""
         return f"{self.path}: /{name}"
 
-    def groups(self, prefix: str, product: str) -> list[str]:
+    def groups(self, prefix: str) -> list[str]:
         """Return the names of the groups that begin with `prefix`.
 
         **Raises:** ValueError where there is none: the file is no such product.
@@ -101,7 +106,7 @@ class ProductFile:
         with refuse_damage(f"{self.path}: not a readable HDF5 file"):
             names = [name for name in map(str, self.file) if name.startswith(prefix)]
         if not names:
-            raise ValueError(f"{self.path}: no group {prefix}...: no {product} product")
+            raise ValueError(f"{self.path}: no group {prefix}...: no {self.product} product")
         return names
 
     def has(self, name: str) -> bool:
@@ -109,34 +114,36 @@ class ProductFile:
         with refuse_damage(f"{self.location(name)}: damaged"):
             return name in self.file
 
-    def dataset(self, name: str, product: str, ndim: int = 1) -> Any:
-        """Return a dataset of numbers of `ndim` dimensions, all of which are stored in the file.
+    def dataset(self, name: str, ndim: int = 1, shape: tuple[int, ...] | None = None) -> Any:
+        """Return a dataset of numbers of `ndim` dimensions, or of a shape, all of which the file stores.
 
         **Raises:** ValueError, naming the file and the dataset, where that is not so.
         """
-        location = self.location(name)
+        location, ndim = self.location(name), ndim if shape is None else len(shape)
         with refuse_damage(f"{location}: damaged"):
             node = self.file.get(name)
-            shape, kind = getattr(node, "shape", None), getattr(getattr(node, "dtype", None), "kind", None)
-        if shape is None or kind is None:
-            raise ValueError(f"{location}: no such dataset; it is part of a {product} product")
+            stored, kind = getattr(node, "shape", None), getattr(getattr(node, "dtype", None), "kind", None)
+        if stored is None or kind is None:
+            raise ValueError(f"{location}: no such dataset; it is part of a {self.product} product")
         if kind not in "iuf":
             raise ValueError(f"{location}: type {node.dtype} where numbers belong")
-        if len(shape) != ndim:
+        if len(stored) != ndim:
             dimensions = "one dimension belongs" if ndim == 1 else f"{ndim} dimensions belong"
-            raise ValueError(f"{location}: shape {shape}, where {dimensions}")
+            raise ValueError(f"{location}: shape {stored}, where {dimensions}")
         with refuse_damage(f"{location}: damaged"):
             # HDF5 returns zeros for what is not stored, as many as are declared.
             is_elsewhere = node.is_virtual or node.external
-            chunk = node.chunks or shape
-            chunks = math.prod(math.ceil(size / part) if part else 0 for size, part in zip(shape, chunk))
+            chunk = node.chunks or stored
+            chunks = math.prod(math.ceil(size / part) if part else 0 for size, part in zip(stored, chunk))
             contiguous = node.id.get_storage_size() // max(node.nbytes, 1)
-            stored = node.id.get_num_chunks() if node.chunks else contiguous
-        if is_elsewhere or stored < chunks:
+            held = node.id.get_num_chunks() if node.chunks else contiguous
+        if is_elsewhere or held < chunks:
             raise ValueError(
-                f"{location}: {math.prod(shape)} numbers are declared, but the file holds {stored} of "
+                f"{location}: {math.prod(stored)} numbers are declared, but the file holds {held} of "
                 f"{chunks} parts of them"
             )
+        if shape not in (None, stored):
+            raise ValueError(f"{location}: shape {stored}; admissible is {shape}, as of the other datasets")
         stated = {attribute: self.attribute(name, attribute) for attribute in _STORED_AS_COUNTS}
         packed = [key for key, usual in _STORED_AS_COUNTS.items() if stated[key] not in (None, usual)]
         if packed:
@@ -158,22 +165,45 @@ class ProductFile:
             is_here = node.file.filename == self.file.filename
             return (self._checked_file[node.name] if is_here and not is_plain else node).attrs[key]
 
-    def read(self, name: str, product: str, ndim: int = 1, rows: Any = slice(None)) -> np.ndarray:
+    def read(
+        self, name: str, ndim: int = 1, rows: Any = slice(None), shape: tuple[int, ...] | None = None
+    ) -> np.ndarray:
         """Return the stored numbers of a dataset, or of some of its rows. **Raises:** as `dataset`."""
-        dataset = self.dataset(name, product, ndim)
+        dataset = self.dataset(name, ndim, shape)
         with refuse_damage(f"{self.location(name)}: damaged"):
             return dataset[rows]
 
-    def numbers(
-        self, name: str, product: str, ndim: int = 1, rows: Any = slice(None)
-    ) -> Float[np.ndarray, "..."]:
-        """Return numbers in double precision; NaN where they are missing by the dataset's attributes.
+    def integers(self, name: str) -> np.ndarray:
+        """Return the whole numbers of a dataset. **Raises:** as `dataset`; ValueError for another type."""
+        numbers = self.read(name)
+        if numbers.dtype.kind not in "iu":
+            raise ValueError(f"{self.location(name)}: type {numbers.dtype} where whole numbers belong")
+        return numbers
 
-        **Raises:** as `dataset`; ValueError for attributes that are no numbers.
+    def numbers(
+        self,
+        name: str,
+        unit: str = "",
+        *,
+        ndim: int = 1,
+        rows: Any = slice(None),
+        shape: tuple[int, ...] | None = None,
+    ) -> Float[np.ndarray, "..."]:
+        """Return numbers in double precision; NaN where they are missing.
+
+        **Arguments:** `unit`: in which they are returned, whatever unit the attribute `units` states: "m",
+        "degrees", "rad", "s" or, of times, such as "s since 2018-01-01". Others stay as they are.
+
+        **Raises:** as `dataset`; ValueError for attributes that are no numbers, and for a unit or an epoch
+        that is not known.
         """
-        values = self.read(name, product, ndim, rows)
+        stored = self.read(name, ndim, rows, shape)
         with np.errstate(over="ignore", invalid="ignore"):
-            return np.where(self._is_missing(name, values), np.nan, values.astype(np.float64))
+            values = stored.astype(np.float64)
+            is_missing = self._is_missing(name, stored)
+            if self._is_fill is not None:
+                is_missing |= self._is_fill(values)
+        return self._in_unit(name, np.where(is_missing, np.nan, values), unit)
 
     def _is_missing(self, name: str, values: np.ndarray) -> np.ndarray:
         """Return True where attributes declare numbers missing."""
@@ -224,26 +254,16 @@ class ProductFile:
                 f"{self.location(name)}: {key} = {' '.join(words)!r}; admissible are numbers"
             ) from None
 
-    def in_unit(self, name: str, values: Float[np.ndarray, "..."], unit: str) -> Float[np.ndarray, "..."]:
-        """Return values of a dataset in another unit than that which its attribute `units` states, if any.
-
-        **Arguments:** `unit`: that is returned: "m", "degrees", "rad", "s" or, of times, such as "s since
-        2018-01-01"; values of other units are returned as they are.
-
-        **Raises:** ValueError, naming the dataset, for a unit or an epoch that is not known.
-        """
+    def _in_unit(self, name: str, values: Float[np.ndarray, "..."], unit: str) -> Float[np.ndarray, "..."]:
+        """Return values of a dataset in a unit, as that of `numbers`."""
         unit, _, epoch = unit.partition(_SINCE)
-        if unit not in _UNITS:
+        stated = [self.attribute(name, key) for key in ("units", "unit")] if unit in _UNITS else []
+        stated = [text_of_attribute(text) for text in stated if text is not None]
+        if not stated:
             return values
-        read_unit, size = _UNITS[unit]
-        stated = self.attribute(name, "units")
-        if stated is None:
-            stated = self.attribute(name, "unit")
-        if stated is None:
-            return values
-        location = self.location(name)
-        name_of_unit, _, stated_epoch = text_of_attribute(stated).partition(_SINCE)
-        stated_size = read_unit(location, name_of_unit)
+        (kind, size), location = _UNITS[unit], self.location(name)
+        name_of_unit, _, stated_epoch = stated[0].partition(_SINCE)
+        stated_size = unit_size(kind, location, name_of_unit)
         if stated_size is not None and not units_agree(stated_size, size):
             values = values * (stated_size / size)
         if epoch and stated_epoch:

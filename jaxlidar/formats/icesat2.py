@@ -196,17 +196,17 @@ def read_atl03(
             check_shape(name, limits, (2,))
             if not limits[0] < limits[1]:
                 raise ValueError(f"{name} = {tuple(limits)} does not increase; admissible is start < end")
-    with open_hdf5(path) as file:
-        beam = _beam(file, beam, "heights", _PHOTONS)
+    with open_hdf5(path, _PHOTONS, _is_fill) as file:
+        beam = _beam(file, beam, "heights")
 
         def segments_of(name: str, unit: str = "", needed: bool = True) -> np.ndarray:
             """Return a column of the segments; NaN where a subset has left it out."""
             field = f"{beam}/geolocation/{name}"
             if not needed and not file.has(field):
                 return np.full(count.shape, np.nan)
-            return _rows_of(file, field, count.size, "segment_ph_cnt", unit=unit)
+            return file.numbers(field, unit, shape=count.shape)
 
-        count = _without_fills(file.numbers(f"{beam}/geolocation/segment_ph_cnt", _PHOTONS))
+        count = file.numbers(f"{beam}/geolocation/segment_ph_cnt")
         start = segments_of("segment_dist_x", "m")
         latitudes = segments_of("reference_photon_lat", "degrees", needed=False)
         is_chosen = np.abs(start) <= MAX_COORDINATE
@@ -221,16 +221,15 @@ def read_atl03(
                 f"{file.location(beam)}: none of its {start.size} segments lies in stretch = {stretch}, "
                 f"latitude = {latitude}"
             )
-        photons = int(file.dataset(f"{beam}/heights/h_ph", _PHOTONS).shape[0])
+        photons = int(file.dataset(f"{beam}/heights/h_ph").shape[0])
         first_photon = _first_photons(file, beam, count, photons)
         # Segments follow one another in a file: one range of rows holds the photons of all.
         run = np.arange(chosen[0], chosen[-1] + 1)
         rows = slice(int(first_photon[run[0]]), int(first_photon[run[-1]] + count[run[-1]]))
         segment = np.repeat(run, count[run].astype(int))
 
-        def photons_of(name: str, unit: str = "", columns: int | None = None) -> np.ndarray:
-            field = f"{beam}/heights/{name}"
-            return _rows_of(file, field, photons, "h_ph", unit=unit, rows=rows, columns=columns)
+        def photons_of(name: str, unit: str = "", *columns: int) -> np.ndarray:
+            return file.numbers(f"{beam}/heights/{name}", unit, rows=rows, shape=(photons, *columns))
 
         height, along = photons_of("h_ph", "m"), photons_of("dist_ph_along", "m")
         # Written so that NaN is left out.
@@ -245,7 +244,7 @@ def read_atl03(
                 "no distance or no time: they are left out",
                 FileWarning,
             )
-        confidence = photons_of("signal_conf_ph", columns=len(SURFACES))[:, SURFACES.index(surface)]
+        confidence = photons_of("signal_conf_ph", "", len(SURFACES))[:, SURFACES.index(surface)]
         quality = (
             photons_of("quality_ph") if file.has(f"{beam}/heights/quality_ph") else np.zeros(height.size)
         )
@@ -285,11 +284,11 @@ def read_atl03(
     )
 
 
-def _beam(file: ProductFile, beam: str | None, group: str, product: str) -> str:
+def _beam(file: ProductFile, beam: str | None, group: str) -> str:
     """Return the name of a beam that the file has. **Raises:** ValueError."""
     present = [name for name in BEAMS if file.has(f"{name}/{group}")]
     if not present:
-        raise ValueError(f"{file.path}: no group gt1l/{group} ... gt3r/{group}: no {product} product")
+        raise ValueError(f"{file.path}: no group gt1l/{group} ... gt3r/{group}: no {file.product} product")
     if beam is None and len(present) > 1:
         raise ValueError(f"{file.path}: beam = None; admissible is one of {', '.join(present)}")
     if beam is None:
@@ -300,35 +299,9 @@ def _beam(file: ProductFile, beam: str | None, group: str, product: str) -> str:
     return beam
 
 
-def _rows_of(
-    file: ProductFile,
-    name: str,
-    length: int,
-    of: str,
-    *,
-    unit: str = "",
-    rows: slice = slice(None),
-    columns: int | None = None,
-) -> np.ndarray:
-    """Return numbers, or those of some rows, of a dataset of `length` rows, as many as that named `of` has.
-
-    **Arguments:** `unit`: that of `ProductFile.in_unit`. `columns`: that it has. None: it has one dimension.
-
-    **Raises:** ValueError for another shape, and as `ProductFile.numbers`.
-    """
-    ndim, admissible = (1, (length,)) if columns is None else (2, (length, columns))
-    shape = file.dataset(name, _PHOTONS, ndim).shape
-    if shape != admissible:
-        raise ValueError(
-            f"{file.location(name)}: shape {shape}; admissible is {admissible}: {of} has {length} rows"
-        )
-    return file.in_unit(name, _without_fills(file.numbers(name, _PHOTONS, ndim, rows)), unit)
-
-
-def _without_fills(values: np.ndarray) -> np.ndarray:
-    """Return numbers with NaN in place of the largest ones of their type, which stand for missing ones."""
-    with np.errstate(invalid="ignore"):
-        return np.where((np.abs(values) > _MAX_NUMBER) | (values == _MAX_INTEGER), np.nan, values)
+def _is_fill(values: np.ndarray) -> np.ndarray:
+    """Return True for the largest numbers of their type, which stand for missing ones."""
+    return (np.abs(values) > _MAX_NUMBER) | (values == _MAX_INTEGER)
 
 
 def _whole_numbers(values: np.ndarray) -> np.ndarray:
@@ -355,7 +328,7 @@ def _first_photons(file: ProductFile, beam: str, count: np.ndarray, size: int) -
     filled = count > 0
     if file.has(f"{beam}/geolocation/ph_index_beg"):
         # The product counts from 1; segments without photons have 0.
-        start = _rows_of(file, f"{beam}/geolocation/ph_index_beg", count.size, "segment_ph_cnt") - 1
+        start = file.numbers(f"{beam}/geolocation/ph_index_beg", shape=count.shape) - 1
         follows = np.all(start[filled][1:] == (start + count)[filled][:-1])
         if follows and np.all((start >= 0)[filled] & (start + count <= size)[filled]):
             # Segments without photons lie between the photons of their neighbours.
@@ -387,8 +360,8 @@ def _background_rate(file: ProductFile, beam: str, time: np.ndarray) -> np.ndarr
     names = [f"{beam}/bckgrd_atlas/{name}" for name in ("delta_time", "bckgrd_rate")]
     if not all(map(file.has, names)):
         return np.full(time.shape, np.nan)
-    when = file.in_unit(names[0], _without_fills(file.numbers(names[0], _PHOTONS)), _TIMES)
-    rate = _rows_of(file, names[1], when.size, "delta_time")
+    when = file.numbers(names[0], _TIMES)
+    rate = file.numbers(names[1], shape=when.shape)
     is_known = np.isfinite(when) & np.isfinite(rate)
     if not np.any(is_known):
         return np.full(time.shape, np.nan)
@@ -407,17 +380,14 @@ def _impulse(file: ProductFile, beam: str) -> PhotonImpulse | None:
     if spot is None:
         return None
     text = text_of_attribute(spot)
-    serving = _whole_numbers(file.numbers(table, _PHOTONS))
+    serving = _whole_numbers(file.numbers(table))
     if not text.isdecimal() or not 1 <= int(text) <= serving.size:
         return None
     group = f"atlas_impulse_response/{spots.get(int(serving[int(text) - 1]))}/tep_histogram"
     if not (file.has(f"{group}/tep_hist") and file.has(f"{group}/tep_hist_time")):
         return None
     # Without numbers that are missing, or so large that sums of them overflow.
-    time, count = (
-        file.in_unit(f"{group}/{name}", _without_fills(file.numbers(f"{group}/{name}", _PHOTONS)), unit)
-        for name, unit in (("tep_hist_time", "s"), ("tep_hist", ""))
-    )
+    time, count = file.numbers(f"{group}/tep_hist_time", "s"), file.numbers(f"{group}/tep_hist")
     # Damaged bytes may be NaN that signal, of which products warn.
     with np.errstate(invalid="ignore"):
         return _impulse_of_histogram(1e9 * time, count)
@@ -503,41 +473,21 @@ def read_atl08(path: str | os.PathLike[str], beam: str | None = None, *, segment
     if segment not in (20.0, 100.0):
         raise ValueError(f"segment = {segment}; admissible is 20 or 100 m")
     is_fine = segment == 20.0
-    with open_hdf5(path) as file:
-        beam = _beam(file, beam, "land_segments", _HEIGHTS)
+    with open_hdf5(path, _HEIGHTS, _is_fill) as file:
+        beam = _beam(file, beam, "land_segments")
         group = f"{beam}/land_segments"
-        first_id = _without_fills(file.numbers(f"{group}/segment_id_beg", _HEIGHTS))
+        first_id = file.numbers(f"{group}/segment_id_beg")
         columns: dict[str, Column] = {}
         for field in _HEIGHT_FIELDS:
-            name = f"{group}/{field.dataset}"
-            fine_name = None if field.at_20_m is None else f"{group}/{field.at_20_m}"
-            if (
-                is_fine
-                and fine_name is not None
-                and (field.name in ("ground", "canopy") or file.has(fine_name))
-            ):
-                name, values = fine_name, file.numbers(fine_name, _HEIGHTS, 2)
-                if values.shape != (first_id.size, _SUBSEGMENTS):
-                    raise ValueError(
-                        f"{file.location(fine_name)}: shape {values.shape}; admissible is "
-                        f"{(first_id.size, _SUBSEGMENTS)}"
-                    )
-                values = values.ravel()
-            elif file.has(name):
-                values = file.numbers(name, _HEIGHTS)
-                if values.shape != first_id.shape:
-                    raise ValueError(
-                        f"{file.location(name)}: shape {values.shape}, segment_id_beg has {first_id.shape}"
-                    )
+            name, fine_name = f"{group}/{field.dataset}", f"{group}/{field.at_20_m}"
+            unit = _TIMES if field.name == "delta_time" else field.unit
+            if is_fine and field.at_20_m and (field.name in ("ground", "canopy") or file.has(fine_name)):
+                values = file.numbers(fine_name, unit, shape=(first_id.size, _SUBSEGMENTS)).ravel()
+            elif file.has(name) or field.name == "ground":
+                values = file.numbers(name, unit, shape=first_id.shape)
                 values = np.repeat(values, _SUBSEGMENTS) if is_fine else values
-            elif field.name == "ground":
-                raise ValueError(
-                    f"{file.location(name)}: no such dataset; it is part of a {_HEIGHTS} product"
-                )
             else:
                 continue
-            unit = _TIMES if field.name == "delta_time" else field.unit
-            values = file.in_unit(name, _without_fills(values), unit)
             columns[field.name] = Column(values, field.unit, field.description)
     if is_fine:
         first_id = (first_id[:, None] + np.arange(_SUBSEGMENTS)).ravel()

@@ -111,13 +111,13 @@ def read_lvis_l1b(path: str | os.PathLike[str]) -> AirborneShots:
 class _LvisShots(AirborneShots):
     def __init__(self, path: Path):
         self.path, self.tables, self.dropped = path, {}, {}
-        with open_hdf5(path) as file:
+        with open_hdf5(path, _PRODUCT) as file:
             last = _number_of_last_sample(file)
             first_position, last_position = (_positions(file, number) for number in ("0", last))
             shots = len(first_position)
-            shapes = {name: file.dataset(name, _PRODUCT, 2).shape for name in ("RXWAVE", "TXWAVE")}
+            shapes = {name: file.dataset(name, 2).shape for name in ("RXWAVE", "TXWAVE")}
             columns = {
-                name: file.in_unit(name, file.numbers(name, _PRODUCT), unit) if file.has(name) else None
+                name: file.numbers(name, unit, shape=(shots,)) if file.has(name) else None
                 for name, unit in _COLUMNS.items()
             }
         for name, shape in shapes.items():
@@ -126,9 +126,6 @@ class _LvisShots(AirborneShots):
                     f"{path}: /{name}: shape {shape}; admissible is ({shots}, samples), at least "
                     f"{QUIET_SAMPLES}"
                 )
-        for name, column in columns.items():
-            if column is not None and column.shape != (shots,):
-                raise ValueError(f"{path}: /{name}: shape {column.shape}, but /LON0 has {(shots,)}")
         self._samples = shapes["RXWAVE"][1]
         if int(last) != self._samples - 1:
             raise ValueError(
@@ -203,8 +200,8 @@ class _LvisShots(AirborneShots):
         start = index // _BLOCK * _BLOCK
         if self._block is None or self._block[0] != start:
             rows = slice(start, start + _BLOCK)
-            with open_hdf5(self.path) as file:
-                received, sent = (file.read(name, _PRODUCT, 2, rows) for name in ("RXWAVE", "TXWAVE"))
+            with open_hdf5(self.path, _PRODUCT) as file:
+                received, sent = (file.read(name, 2, rows) for name in ("RXWAVE", "TXWAVE"))
             self._block = start, received, sent
         _, received, sent = self._block
         return received[index - start], sent[index - start]
@@ -262,14 +259,10 @@ def _number_of_last_sample(file: ProductFile) -> str:
 
 def _positions(file: ProductFile, number: str) -> Float[np.ndarray, "shots 3"]:
     """Return longitude, latitude and elevation of a sample, such as "1023"."""
-    columns = [
-        file.in_unit(f"{axis}{number}", file.numbers(f"{axis}{number}", _PRODUCT), unit)
-        for axis, unit in (("LON", "degrees"), ("LAT", "degrees"), ("Z", "m"))
-    ]
-    if len({column.shape for column in columns}) > 1:
-        shapes = [column.shape for column in columns]
-        raise ValueError(f"{file.path}: /LON{number}, /LAT{number}, /Z{number}: shapes {shapes}")
-    position = np.stack(columns, axis=-1)
+    longitude = file.numbers(f"LON{number}", "degrees")
+    latitude = file.numbers(f"LAT{number}", "degrees", shape=longitude.shape)
+    elevation = file.numbers(f"Z{number}", "m", shape=longitude.shape)
+    position = np.stack([longitude, latitude, elevation], axis=-1)
     # Longitudes of some versions lie in [0, 360).
     position[:, 0] = np.remainder(position[:, 0] + 180.0, 360.0) - 180.0
     return position

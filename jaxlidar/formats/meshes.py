@@ -16,7 +16,7 @@ from jaxtyping import Float, Int
 from jaxlidar._fields.checks import check_choice, check_number, required_for
 from jaxlidar.formats.checks import MAX_COORDINATE, existing_file
 from jaxlidar.formats.text import parse_integer, parse_number, read_lines
-from jaxlidar.formats.units import unit_length
+from jaxlidar.formats.units import unit_size
 from jaxlidar.plants.meshes import Mesh
 
 # Endings of names of files, and the vertical axis of their format; None: it has none.
@@ -179,7 +179,7 @@ def _unit(path: Path, lines: list[str]) -> float | None:
     sizes = {}
     for number, line in enumerate(lines, 1):
         if name := _UNIT_COMMENT.match(line):
-            sizes[unit_length(f"{path}: line {number}", name[1]) or 1.0] = number
+            sizes[unit_size("length", f"{path}: line {number}", name[1]) or 1.0] = number
     if len(sizes) > 1:
         raise ValueError(
             f"{path}: lines {', '.join(map(str, sizes.values()))} name different units of length"
@@ -226,7 +226,7 @@ def _read_other(path: Path, part: str, uses_unit: bool) -> _StoredMesh:
     if uses_unit and metres is None:
         if len(units) > 1:
             raise ValueError(f"{path}: several units of length: {', '.join(map(str, units))}")
-        metres = unit_length(str(path), units.pop())
+        metres = unit_size("length", str(path), units.pop())
     vertices, faces = _corner_vertices(path, np.concatenate(vertices), np.concatenate(faces), None)
     return _StoredMesh(vertices, faces, np.concatenate(material), tuple(names), metres, str(path))
 

@@ -11,7 +11,7 @@ import numpy as np
 from jaxlidar._fields.checks import check_number, warn_user
 from jaxlidar.formats.checks import MAX_COORDINATE, FileWarning, column_index
 from jaxlidar.formats.text import parse_integer, parse_number, read_lines, split_cells
-from jaxlidar.formats.units import unit_length
+from jaxlidar.formats.units import unit_size
 from jaxlidar.plants.tree import Tree
 
 # Columns in use, with their names in files, without case, spaces and underscores: those of SimpleForest, of
@@ -104,7 +104,7 @@ def read_qsm(path: str | os.PathLike[str], *, scale: float | None = None) -> Tre
     units = {}
     for k in _LENGTHS:
         cell = head[column[k]]
-        stated = None if cell is None else unit_length(f"{path}: line 1: {k}", cell[2])
+        stated = None if cell is None else unit_size("length", f"{path}: line 1: {k}", cell[2])
         units[k] = scale or stated or 1.0
     rows: dict[int, _Cylinder] = {}
     for number, text in enumerate(lines[1:], 2):

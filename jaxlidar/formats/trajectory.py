@@ -22,7 +22,7 @@ from jaxlidar._fields.crs import (
 from jaxlidar.formats.checks import MAX_COORDINATE
 from jaxlidar.formats.coordinates import GEOGRAPHIC
 from jaxlidar.formats.text import parse_number, read_lines, split_cells
-from jaxlidar.formats.units import unit_angle, unit_length
+from jaxlidar.formats.units import unit_size
 from jaxlidar.sensors.trajectory import Trajectory
 
 # Names of columns in files, without case, spaces, underscores and units.
@@ -46,9 +46,8 @@ _NAMES = {
     "yaw": ("yaw", "heading", "trueheading", "azimuth", "psi", "hdg"),
 }
 _REQUIRED = ("time", "z")
-# Units of times by their names in a header, in s.
-_SECONDS = {"": 1.0, "s": 1.0, "sec": 1.0, "seconds": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9}
-_SECONDS |= {"sow": 1.0, "gps": 1.0}
+# Names that stand in the place of the unit of GPS times, which are seconds.
+_SECONDS = re.compile(r"[\[(]\s*(sow|gps)\s*[\])]", re.IGNORECASE)
 # Names, followed by units, of times that are not GPS time: UTC differs from it by leap seconds, and seconds
 # of the day do not count the days of the week.
 _OTHER_TIME = re.compile(
@@ -249,7 +248,7 @@ def _declared_in_comments(
             crs = system.map_name
     if "units" in declared:
         location, text = declared["units"]
-        unit = unit_length(location, text)
+        unit = unit_size("length", location, text)
         if horizontal is not None and unit is not None and not units_agree(horizontal, unit):
             raise ValueError(f"{location}: {text}, but the system {declared['crs'][1]} is in another unit")
         horizontal = vertical = unit
@@ -294,15 +293,12 @@ def _check_columns(location: str, columns: dict[str, _Column]) -> None:
 
 def _unit(location: str, quantity: str, name: str, unit: str | None) -> float:
     """Return the size of a column's unit in m, degrees or s."""
-    if quantity in ("x", "y", "z"):
-        return unit_length(f"{location}: {quantity}", unit) or 1.0
-    if quantity != "time":
-        return float(np.rad2deg(unit_angle(f"{location}: {quantity}", unit) or np.deg2rad(1.0)))
-    text = (unit or "").strip("[]() ").lower()
-    if text not in _SECONDS:
-        admissible = ", ".join(filter(None, _SECONDS))
-        raise ValueError(f"{location}: {name!r} is in the unknown unit {text!r}; admissible are {admissible}")
-    return _SECONDS[text]
+    kind = {"time": "time", "x": "length", "y": "length", "z": "length"}.get(quantity, "angle")
+    is_named = kind == "time" and unit is not None and _SECONDS.fullmatch(unit)
+    size = 1.0 if is_named else unit_size(kind, f"{location}: {name!r}", unit)
+    if kind == "angle":
+        return float(np.rad2deg(size or np.deg2rad(1.0)))
+    return size or 1.0
 
 
 def _value(path: Path, line: int, column: _Column, cells: list[str]) -> float:

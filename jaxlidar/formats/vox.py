@@ -15,7 +15,7 @@ from jaxlidar._fields.checks import check_choice, check_range, warn_user
 from jaxlidar._fields.crs import common_system
 from jaxlidar.formats.checks import MAX_COORDINATE, FileWarning, column_index, max_unpacked_size
 from jaxlidar.formats.text import parse_integer, parse_number, read_lines, split_cells
-from jaxlidar.formats.units import unit_length
+from jaxlidar.formats.units import unit_size
 from jaxlidar.optics.leaf_angles import LeafAngles
 from jaxlidar.scenes.voxels import VoxelMap
 
@@ -263,7 +263,7 @@ def _checked_system(path: Path, header: dict[str, tuple[str, int]]) -> str | Non
     names = {}
     for key, (text, line) in header.items():
         location = f"{path}: line {line}: {key}"
-        if key in ("unit", "units") and unit_length(location, text) != 1.0:
+        if key in ("unit", "units") and unit_size("length", location, text) != 1.0:
             raise ValueError(f"{location} = {text}; read are voxels in metres")
         if key in ("crs", "srs", "epsg"):
             names[location] = f"EPSG:{text}" if text.isdigit() else text

@@ -19,7 +19,7 @@ import pytest
 import jaxlidar as jl
 from jaxlidar import cli
 from jaxlidar._fields.crs import directions_of_north, system_of_name, transform
-from jaxlidar.formats.units import unit_length
+from jaxlidar.formats.units import unit_size
 from jaxlidar.io import (
     read_dem,
     read_gedi_l1b,
@@ -862,4 +862,4 @@ def test_units_of_voxels(tmp_path, entry, says):
     ],
 )
 def test_names_of_units(name, metres):
-    assert unit_length("a", name) == metres
+    assert unit_size("length", "a", name) == metres
