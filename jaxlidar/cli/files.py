@@ -1,19 +1,20 @@
 """The commands `jaxlidar info` and `jaxlidar convert`."""
 
-import contextlib
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import click
 import numpy as np
 
+from jaxlidar._fields.columns import Column, match_columns
 from jaxlidar.cli.shared import ResultPath
 from jaxlidar.formats.airborne import AirborneShots
 from jaxlidar.formats.coordinates import GEOGRAPHIC
 from jaxlidar.formats.dem import read_grid
-from jaxlidar.formats.footprints import quantities_of_columns, read_places
+from jaxlidar.formats.footprints import COLUMNS as PLACE_COLUMNS
+from jaxlidar.formats.footprints import read_places
 from jaxlidar.formats.las import read_stored_points
 from jaxlidar.formats.las_header import read_header
 from jaxlidar.formats.las_waveforms import has_packets
@@ -36,7 +37,7 @@ from jaxlidar.io import (
 )
 from jaxlidar.optics.prospect import Prospect
 from jaxlidar.optics.spectra import read_spectrum_csv
-from jaxlidar.plants.inventory import columns_in_use
+from jaxlidar.plants.inventory import COLUMNS as INVENTORY_COLUMNS
 from jaxlidar.results.netcdf import open as open_result
 from jaxlidar.scenes.canopy import Canopy
 from jaxlidar.scenes.scene import Scene
@@ -184,7 +185,7 @@ def describe_spectrum(path: Path) -> str:
     return f"spectrum {spectrum.name!r} of {spectrum.wavelength.size} samples from {low:g} to {high:g} nm"
 
 
-def describe_inventory(path: Path, columns: dict[str, str], others: list[str]) -> str:
+def describe_inventory(path: Path, columns: dict[str, Column], others: list[str]) -> str:
     """Describe an inventory, with the names of its columns by quantity, and those that are not read."""
     trees = read_inventory(path)
     places = np.stack([trees.x, trees.y])
@@ -198,12 +199,13 @@ def describe_inventory(path: Path, columns: dict[str, str], others: list[str]) -
     if trees.species is not None:
         names, counts = np.unique(trees.species, return_counts=True)
         lines.append("species: " + ", ".join(f"{count:,} {name}" for name, count in zip(names, counts)))
-    read = [name if name == quantity else f"{name} as {quantity}" for quantity, name in columns.items()]
+    in_order = sorted(columns.items(), key=lambda item: item[1].index)
+    read = [column.name if column.name == q else f"{column.name} as {q}" for q, column in in_order]
     not_read = f"; not read: {', '.join(others)}" if others else ""
     return "\n".join([lines[0], *sorted(lines[1:]), f"columns: {', '.join(read)}{not_read}"])
 
 
-def describe_places(path: Path, quantities: set[str]) -> str:
+def describe_places(path: Path, quantities: Collection[str]) -> str:
     """Describe a table of the places of footprints."""
     # Longitude and latitude stay as they are.
     places = read_places(path, GEOGRAPHIC)
@@ -223,16 +225,17 @@ def describe_csv(path: Path) -> str:
     if TREE_COLUMN.search(head):
         return describe_tree(path)
     names = [name.strip() for name in re.split(r"[,;\t]", head)]
-    columns: dict[str, str] = {}
-    with contextlib.suppress(ValueError):
-        columns, _ = columns_in_use(names)
-    quantities, has_time = quantities_of_columns(names), TIME_COLUMN.search(head) is not None
-    has_places = quantities >= {"x", "y"} or quantities >= {"longitude", "latitude"}
-    is_of_shots = has_places and not quantities.isdisjoint(("shot_number", "beam"))
-    if columns and not has_time and not is_of_shots:
-        return describe_inventory(path, columns, [name for name in names if name not in columns.values()])
+    places = match_columns(f"{path}: line 1", names, PLACE_COLUMNS).keys()
+    has_time = TIME_COLUMN.search(head) is not None
+    has_places = places >= {"x", "y"} or places >= {"longitude", "latitude"}
+    is_of_shots = has_places and not places.isdisjoint(("shot_number", "beam"))
+    if not has_time and not is_of_shots:
+        columns = match_columns(f"{path}: line 1", names, INVENTORY_COLUMNS)
+        if columns.keys() >= {"x", "y", "height"}:
+            read = [column.name for column in columns.values()]
+            return describe_inventory(path, columns, [name for name in names if name not in read])
     if is_of_shots or (has_places and not has_time):
-        return describe_places(path, quantities)
+        return describe_places(path, places)
     if not TRAJECTORY_COLUMN.search(head):
         return describe_spectrum(path)
     if GEOGRAPHIC_COLUMN.search(head):

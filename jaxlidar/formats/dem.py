@@ -12,10 +12,10 @@ from jaxtyping import Float
 
 from jaxlidar._fields.checks import check_number, check_numbers, check_shape, warn_user
 from jaxlidar._fields.crs import CoordinateSystem, system_of_crs, system_of_name, units_agree
+from jaxlidar._fields.units import unit_size
 from jaxlidar.formats.checks import MAX_COORDINATE, FileWarning, check_unpacked_size, existing_file
 from jaxlidar.formats.coordinates import MAX_ELEVATION, MIN_ELEVATION, open_raster
 from jaxlidar.formats.text import parse_integer, parse_number, read_lines
-from jaxlidar.formats.units import unit_size
 from jaxlidar.optics.laws import AbstractLaw, Lambertian
 from jaxlidar.scenes.terrain import Terrain
 

@@ -1,7 +1,6 @@
 """Reader of the places of footprints: text tables, and GEDI's levels 1B and 2A."""
 
 import os
-import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -10,19 +9,18 @@ import numpy as np
 from jaxtyping import Float, Int, Shaped
 
 from jaxlidar._fields.checks import warn_user
-from jaxlidar._fields.columns import warn_unread_columns
+from jaxlidar._fields.columns import check_columns, match_columns
 from jaxlidar._fields.crs import transform
 from jaxlidar.formats.checks import MAX_COORDINATE, FileWarning
 from jaxlidar.formats.coordinates import GEOGRAPHIC
 from jaxlidar.formats.gedi import BEAMS
 from jaxlidar.formats.hdf5 import open_hdf5
-from jaxlidar.formats.text import parse_number, read_lines, split_cells
+from jaxlidar.formats.text import parse_number, read_table
 
 # Beam of footprints whose file names none.
 _BEAM = "BEAM0101"
-# Names of columns of places, without case, spaces and underscores. That of shot numbers may be "id" where no
-# other one is.
-_COLUMNS = {
+# Names of columns of places, without case, spaces, underscores and units.
+COLUMNS = {
     "x": ("x", "easting", "east"),
     "y": ("y", "northing", "north"),
     "longitude": ("longitude", "lon", "lng"),
@@ -30,7 +28,8 @@ _COLUMNS = {
     "shot_number": ("shotnumber", "shot"),
     "beam": ("beam",),
 }
-_OTHER_NUMBER = "id"
+# That of shot numbers where none of the names above is.
+_OTHER_NUMBER = {"shot_number": ("id",)}
 # Longitude and latitude of shots in levels 1B and 2A: the first pair that a beam has is read.
 _PLACES_OF_PRODUCTS = (
     ("lon_lowestmode", "lat_lowestmode"),
@@ -78,20 +77,25 @@ def read_places(path: str | os.PathLike[str], crs: str) -> Places:
     """
     if Path(path).suffix.lower() in (".h5", ".hdf5"):
         return _places_of_product(Path(path), crs)
-    path, lines = read_lines(path)
-    delimiter = max(",;\t", key=lines[0].count) if lines else ","
-    names = [name.strip() for name in split_cells(path, 1, lines[0], delimiter)] if lines else []
-    columns = _columns(path, names)
-    axes = ("x", "y") if "x" in columns else ("longitude", "latitude")
-    numbers = [number for number, text in enumerate(lines[1:], 2) if text.strip()]
-    if not numbers:
+    path, names, lines = read_table(path)
+    location = f"{path}: line 1"
+    columns = match_columns(location, names, COLUMNS)
+    if "shot_number" not in columns:
+        columns |= match_columns(location, names, _OTHER_NUMBER)
+    check_columns(location, names, columns, COLUMNS)
+    rows = dict(lines)
+    if not rows:
         raise ValueError(f"{path}: line 2: no footprint; admissible is one row or more")
-    rows = [split_cells(path, number, lines[number - 1], delimiter, len(names)) for number in numbers]
-    cells = {quantity: [row[i].strip() for row in rows] for quantity, i in columns.items()}
+    is_of_map = "x" in columns
+    axes, kind = (("x", "y"), "length") if is_of_map else (("longitude", "latitude"), "angle")
+    cells = {
+        quantity: [row[column.index].strip() for row in rows.values()] for quantity, column in columns.items()
+    }
 
     def coordinates(axis: str, limit: float) -> list[float]:
-        values = [parse_number(path, number, axis, cell) for number, cell in zip(numbers, cells[axis])]
-        for number, value in zip(numbers, values):
+        unit = columns[axis].size(location, kind)
+        values = [unit * parse_number(path, number, axis, cell) for number, cell in zip(rows, cells[axis])]
+        for number, value in zip(rows, values):
             # Written so that NaN is refused.
             if not abs(value) <= limit:
                 raise ValueError(
@@ -99,64 +103,18 @@ def read_places(path: str | os.PathLike[str], crs: str) -> Places:
                 )
         return values
 
-    limits = (MAX_COORDINATE, MAX_COORDINATE) if axes[0] == "x" else (180.0, 90.0)
+    limits = (MAX_COORDINATE, MAX_COORDINATE) if is_of_map else (180.0, 90.0)
     position = np.column_stack([coordinates(axis, limit) for axis, limit in zip(axes, limits)])
-    if axes[0] == "longitude":
-        position = _on_map(path, crs, position, [f"line {number}" for number in numbers])
+    if not is_of_map:
+        position = _on_map(path, crs, position, [f"line {number}" for number in rows])
     shot_numbers = np.arange(1, len(rows) + 1, dtype=np.uint64)
     if "shot_number" in cells:
-        shot_numbers = _shot_numbers(path, dict(zip(numbers, cells["shot_number"])))
+        shot_numbers = _shot_numbers(path, dict(zip(rows, cells["shot_number"])))
     beams = [cell.upper() for cell in cells.get("beam", [_BEAM] * len(rows))]
-    for number, beam in zip(numbers, beams):
+    for number, beam in zip(rows, beams):
         if beam not in BEAMS:
             raise ValueError(f"{path}: line {number}: beam = {beam!r} is none of {', '.join(BEAMS)}")
     return Places(position, shot_numbers, np.array(beams))
-
-
-def quantities_of_columns(names: Sequence[str]) -> set[str]:
-    """Return which of x, y, longitude, latitude, shot_number and beam have a column of one of these names."""
-    bare_names = {_bare(name) for name in names}
-    return {quantity for quantity, known in _COLUMNS.items() if bare_names.intersection(known)}
-
-
-def _bare(name: str) -> str:
-    """Return the name of a column in lower case, without spaces and underscores."""
-    return re.sub(r"[\s_\-.]", "", name.lower())
-
-
-def _columns(path: Path, names: list[str]) -> dict[str, int]:
-    """Return the number of the column of each quantity. **Warns, raises:** as `read_places`."""
-    columns = {}
-    bare_names = [_bare(name) for name in names]
-    for quantity, known in _COLUMNS.items():
-        matches = [i for i, name in enumerate(bare_names) if name in known]
-        if quantity == "shot_number" and not matches:
-            matches = [i for i, name in enumerate(bare_names) if name == _OTHER_NUMBER]
-        if len(matches) > 1:
-            raise ValueError(
-                f"{path}: line 1: {quantity} may be any of the columns "
-                f"{', '.join(repr(names[i]) for i in matches)}; remove or rename all but one"
-            )
-        if matches:
-            columns[quantity] = matches[0]
-    pairs = [[axis for axis in pair if axis in columns] for pair in (("x", "y"), ("longitude", "latitude"))]
-    if all(pairs):
-        of_map, of_earth = (" and ".join(repr(names[columns[axis]]) for axis in pair) for pair in pairs)
-        raise ValueError(
-            f"{path}: line 1: columns {of_map} of a map, and {of_earth} in degrees; remove one pair"
-        )
-    for axis in ("x", "y") if pairs[0] else ("longitude", "latitude"):
-        if axis not in columns:
-            raise ValueError(
-                f"{path}: line 1: no column {axis}; admissible are x and y in m, or longitude and latitude "
-                f"in degrees; there are {', '.join(names) or 'none'}"
-            )
-    unread = [name for i, name in enumerate(names) if i not in columns.values()]
-    missing = {
-        quantity: _COLUMNS[quantity] for quantity in ("shot_number", "beam") if quantity not in columns
-    }
-    warn_unread_columns(f"{path}: line 1", unread, missing)
-    return columns
 
 
 def _shot_numbers(path: Path, cells: dict[int, str]) -> Int[np.ndarray, " n"]:

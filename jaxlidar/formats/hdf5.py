@@ -29,8 +29,8 @@ from jaxtyping import Float
 
 from jaxlidar._fields.checks import required_for
 from jaxlidar._fields.crs import units_agree
+from jaxlidar._fields.units import unit_size
 from jaxlidar.formats.checks import check_unpacked_size, existing_file, refuse_damage
-from jaxlidar.formats.units import unit_size
 
 # Attributes of numbers that are stored as counts.
 _STORED_AS_COUNTS = {"scale_factor": 1.0, "add_offset": 0.0}

@@ -3,8 +3,8 @@
 import os
 
 from jaxlidar._fields.crs import crs_name
-from jaxlidar.formats.text import read_lines, split_cells
-from jaxlidar.plants.inventory import Inventory, inventory_of_table
+from jaxlidar.formats.text import read_table
+from jaxlidar.plants.inventory import Inventory, inventory_of_columns
 
 
 def read_inventory(path: str | os.PathLike[str], *, crs: str | int | None = None) -> Inventory:
@@ -37,19 +37,8 @@ def read_inventory(path: str | os.PathLike[str], *, crs: str | int | None = None
     (('beech', 'oak'), [21.4, 18.0], [0.35000000000000003, nan])
     """
     system = crs_name(crs)
-    path, lines = read_lines(path)
-    if not lines or not lines[0].strip():
-        raise ValueError(f"{path}: line 1: there is no line that names the columns")
-    delimiter = max(",;\t", key=lines[0].count)
-    names = [name.strip() for name in split_cells(path, 1, lines[0], delimiter)]
-    for name in names:
-        if names.count(name) > 1:
-            raise ValueError(f"{path}: line 1: {names.count(name)} columns have the name {name!r}")
-    numbers = [number for number, text in enumerate(lines[1:], 2) if text.strip()]
-    rows = [split_cells(path, number, lines[number - 1], delimiter, len(names)) for number in numbers]
-    columns = {name: [row[i] for row in rows] for i, name in enumerate(names)}
-    place_of = [f"{path}: line {number}" for number in numbers]
-    try:
-        return inventory_of_table(columns, place_of.__getitem__)._replace(crs=system)
-    except ValueError as error:
-        raise error if str(error).startswith(str(path)) else ValueError(f"{path}: line 1: {error}") from None
+    path, names, rows = read_table(path)
+    cells = dict(rows)
+    columns = list(zip(*cells.values())) or [()] * len(names)
+    places = [f"{path}: line {number}" for number in cells]
+    return inventory_of_columns(f"{path}: line 1", names, columns, places)._replace(crs=system)

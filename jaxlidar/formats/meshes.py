@@ -14,9 +14,9 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jaxlidar._fields.checks import check_choice, check_number, required_for
+from jaxlidar._fields.units import unit_size
 from jaxlidar.formats.checks import MAX_COORDINATE, existing_file
 from jaxlidar.formats.text import parse_integer, parse_number, read_lines
-from jaxlidar.formats.units import unit_size
 from jaxlidar.plants.meshes import Mesh
 
 # Endings of names of files, and the vertical axis of their format; None: it has none.

@@ -2,16 +2,15 @@
 
 import math
 import os
-import re
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
 from jaxlidar._fields.checks import check_number, warn_user
+from jaxlidar._fields.columns import Column, name_and_unit
 from jaxlidar.formats.checks import MAX_COORDINATE, FileWarning, column_index
-from jaxlidar.formats.text import parse_integer, parse_number, read_lines, split_cells
-from jaxlidar.formats.units import unit_size
+from jaxlidar.formats.text import parse_integer, parse_number, read_table
 from jaxlidar.plants.tree import Tree
 
 # Columns in use, with their names in files, without case, spaces and underscores: those of SimpleForest, of
@@ -28,10 +27,6 @@ _INTEGERS = ("id", "parent", "order")
 _LENGTHS = (*(f"{end}{axis}" for end in ("start", "end") for axis in "xyz"), "radius")
 # The parent of a cylinder that has none, as this module writes it.
 _NO_PARENT = -1
-
-
-# The name of a column, and its unit in brackets.
-_NAME_AND_UNIT = re.compile(r"\s*(.*?)\s*([\[(][^\])]*[\])])?\s*$")
 
 
 class TreeRead(NamedTuple):
@@ -94,23 +89,14 @@ def read_qsm(path: str | os.PathLike[str], *, scale: float | None = None) -> Tre
     """
     if scale is not None:
         check_number("scale", scale, 0.0, low_open=True)
-    path, lines = read_lines(path)
-    if not lines:
-        raise ValueError(f"{path}: line 1: the file is empty")
-    delimiter = max(",;\t", key=lines[0].count)
-    head = [_NAME_AND_UNIT.match(cell) for cell in split_cells(path, 1, lines[0], delimiter)]
-    names = ["" if cell is None else cell[1].lower().replace("_", "") for cell in head]
-    column = _column_indices(path, names)
-    units = {}
-    for k in _LENGTHS:
-        cell = head[column[k]]
-        stated = None if cell is None else unit_size("length", f"{path}: line 1: {k}", cell[2])
-        units[k] = scale or stated or 1.0
-    rows: dict[int, _Cylinder] = {}
-    for number, text in enumerate(lines[1:], 2):
-        if not text.strip():
-            continue
-        row = _cylinder(path, number, column, split_cells(path, number, text, delimiter, len(names)), units)
+    path, names, lines = read_table(path)
+    column = _columns(path, names)
+    units = {k: column[k].size(f"{path}: line 1", "length") for k in _LENGTHS}
+    if scale is not None:
+        units = dict.fromkeys(_LENGTHS, scale)
+    number, rows = 1, dict[int, _Cylinder]()
+    for number, cells in lines:
+        row = _cylinder(path, number, column, cells, units)
         if row.id in rows:
             raise ValueError(f"{path}: line {number}: ID {row.id} was given in line {rows[row.id].line}")
         rows[row.id] = row
@@ -132,7 +118,7 @@ def read_qsm(path: str | os.PathLike[str], *, scale: float | None = None) -> Tre
         else:
             dropped["without a length"] += 1
     if not cylinders:
-        raise ValueError(f"{path}: line {len(lines)}: there is no cylinder in the file")
+        raise ValueError(f"{path}: line {number}: there is no cylinder in the file")
     radius = np.array([row.radius for row in cylinders])
     tree = Tree(
         start=np.array([row.start for row in cylinders]),
@@ -168,22 +154,24 @@ class _Cylinder(NamedTuple):
     radius: float
 
 
-def _column_indices(path: Path, names: list[str]) -> dict[str, int]:
-    """Return the index of each column in use. Branch orders may be missing."""
-    indices = {}
-    for column, file_names in _COLUMNS.items():
-        present = [name for name in file_names if name in names]
+def _columns(path: Path, names: list[str]) -> dict[str, Column]:
+    """Return each column in use: that of its first name which the table has. Orders may be missing."""
+    plain, units = zip(*map(name_and_unit, names))
+    columns = {}
+    for column, known in _COLUMNS.items():
+        present = [name for name in known if name in plain]
         if present or column != "order":
-            indices[column] = column_index(f"{path}: line 1", names, (present or file_names)[0])
-    return indices
+            i = column_index(f"{path}: line 1", plain, (present or known)[0])
+            columns[column] = Column(i, names[i], units[i])
+    return columns
 
 
 def _cylinder(
-    path: Path, line: int, column: dict[str, int], cells: list[str], units: dict[str, float]
+    path: Path, line: int, column: dict[str, Column], cells: list[str], units: dict[str, float]
 ) -> _Cylinder:
     location = f"{path}: line {line}"
-    integers = {k: parse_integer(path, line, k, cells[column[k]]) for k in _INTEGERS if k in column}
-    lengths = {k: units[k] * parse_number(path, line, k, cells[column[k]]) for k in _LENGTHS}
+    integers = {k: parse_integer(path, line, k, cells[column[k].index]) for k in _INTEGERS if k in column}
+    lengths = {k: units[k] * parse_number(path, line, k, cells[column[k].index]) for k in _LENGTHS}
     for k, value in lengths.items():
         if not math.isfinite(value):
             raise ValueError(f"{location}: {k} is not finite")

@@ -3,6 +3,7 @@
 import codecs
 import csv
 import os
+from collections.abc import Iterator
 from pathlib import Path
 
 from jaxlidar.formats.checks import MAX_EXACT_INTEGER, existing_file
@@ -24,6 +25,27 @@ def read_lines(path: str | os.PathLike[str]) -> tuple[Path, list[str]]:
         number, error = undecodable
         raise ValueError(f"{path}: not a text file: line {number}: {error}") from error
     return path, [line.decode(encoding) for line in lines]
+
+
+def read_table(path: str | os.PathLike[str]) -> tuple[Path, list[str], Iterator[tuple[int, list[str]]]]:
+    """Read a text file of comma-, semicolon- or tab-separated values whose first line names the columns.
+
+    **Returns:** the path, the names, and the number and the cells of each line that is not empty.
+
+    **Raises:** as `read_lines`; ValueError, naming file and line, for a file without names, and for a line of
+    another number of cells, when its turn comes.
+    """
+    path, lines = read_lines(path)
+    if not lines or not lines[0].strip():
+        raise ValueError(f"{path}: line 1: there is no line that names the columns")
+    delimiter = max(",;\t", key=lines[0].count)
+    names = [name.strip() for name in split_cells(path, 1, lines[0], delimiter)]
+    rows = (
+        (number, split_cells(path, number, text, delimiter, len(names)))
+        for number, text in enumerate(lines[1:], 2)
+        if text.strip()
+    )
+    return path, names, rows
 
 
 def _first_undecodable(lines: list[bytes], encoding: str) -> tuple[int, UnicodeDecodeError] | None:

@@ -4,13 +4,12 @@ import os
 import re
 import warnings
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
 from jaxlidar._fields.checks import UnitWarning
-from jaxlidar._fields.columns import warn_unread_columns
+from jaxlidar._fields.columns import Column, check_columns, match_columns, plain_name
 from jaxlidar._fields.crs import (
     common_system,
     directions_of_north,
@@ -19,10 +18,10 @@ from jaxlidar._fields.crs import (
     transform,
     units_agree,
 )
+from jaxlidar._fields.units import unit_size
 from jaxlidar.formats.checks import MAX_COORDINATE
 from jaxlidar.formats.coordinates import GEOGRAPHIC
 from jaxlidar.formats.text import parse_number, read_lines, split_cells
-from jaxlidar.formats.units import unit_size
 from jaxlidar.sensors.trajectory import Trajectory
 
 # Names of columns in files, without case, spaces, underscores and units.
@@ -45,30 +44,18 @@ _NAMES = {
     "pitch": ("pitch", "theta"),
     "yaw": ("yaw", "heading", "trueheading", "azimuth", "psi", "hdg"),
 }
-_REQUIRED = ("time", "z")
-# Names that stand in the place of the unit of GPS times, which are seconds.
-_SECONDS = re.compile(r"[\[(]\s*(sow|gps)\s*[\])]", re.IGNORECASE)
+# What stands in the place of the unit of GPS times, which are seconds.
+_SECONDS = ("sow", "gps")
+# Kinds of the units of columns; those of others are angles.
+_KINDS = {"time": "time", "x": "length", "y": "length", "z": "length"}
 # Names, followed by units, of times that are not GPS time: UTC differs from it by leap seconds, and seconds
 # of the day do not count the days of the week.
 _OTHER_TIME = re.compile(
     r"utc|gmt|unix|posix|glonass|ofday|systemtime|pctime|local(time|sec)|tai(time|sec)|time(local|tai|sod|tod)"
     r"|^(tai|sod|tod)$"
 )
-_NAME_AND_UNIT = re.compile(r"\s*(.*?)\s*([\[(][^\])]*[\])])?\s*$")
 # A comment that names a unit of length or a reference system.
 _COMMENT = re.compile(r"\s*#\s*(crs|srs|units?)\s*[:=]\s*(.*?)\s*$", re.IGNORECASE)
-
-
-class _Column(NamedTuple):
-    """A column of the table: its index, its name in the file, and its unit in units of the trajectory.
-
-    `is_declared`: True if the file names the unit beside the name.
-    """
-
-    index: int
-    name: str
-    unit: float
-    is_declared: bool
 
 
 def read_trajectory(path: str | os.PathLike[str], *, crs: str | None = None) -> Trajectory:
@@ -114,13 +101,18 @@ def read_trajectory(path: str | os.PathLike[str], *, crs: str | None = None) -> 
     path, lines = read_lines(path)
     head, delimiter, columns = _header(path, lines)
     location, n_columns = f"{path}: line {head + 1}", len(_cells(path, head + 1, lines[head], delimiter))
+    sizes = {name: column.size(location, _KINDS.get(name, "angle")) for name, column in columns.items()}
     is_geographic = "longitude" in columns
     # A heading from true north beside longitude and latitude need not say so.
-    is_true = "yaw" in columns and "true" in _plain(columns["yaw"].name)
+    is_true = "yaw" in columns and "true" in plain_name(columns["yaw"].name)
     if is_true and crs is None:
         name = columns["yaw"].name
         raise ValueError(f"{location}: {name!r} is from true north; give crs, the map of x and y")
-    lengths, declared_crs = _declared_in_comments(path, lines, is_geographic, columns)
+    declared, declared_crs = _declared_in_comments(path, lines, is_geographic)
+    for name, size in declared.items():
+        # A unit beside the name of a column goes before those of comments.
+        if name in columns and columns[name].unit is None and size is not None:
+            sizes[name] = size
     if is_geographic and crs is None:
         crs = declared_crs
     if is_geographic and crs is None:
@@ -139,9 +131,7 @@ def read_trajectory(path: str | os.PathLike[str], *, crs: str | None = None) -> 
         numbers.append(number)
     if not rows:
         raise ValueError(f"{path}: line {len(lines)}: there is no row in the file")
-    values = dict(zip(columns, np.array(rows).T))
-    for name, length in lengths.items():
-        values[name] = values[name] * length
+    values = {name: sizes[name] * column for name, column in zip(columns, np.array(rows).T)}
     for name in ("x", "y", "z"):
         if name in values and np.any(np.abs(values[name]) > MAX_COORDINATE):
             row = int(np.argmax(np.abs(values[name]) > MAX_COORDINATE))
@@ -158,7 +148,7 @@ def read_trajectory(path: str | os.PathLike[str], *, crs: str | None = None) -> 
     angles = [columns[name] for name in ("roll", "pitch", "yaw") if name in columns]
     try:
         with warnings.catch_warnings():
-            if any(column.is_declared for column in angles):
+            if any(column.unit is not None for column in angles):
                 # Angles whose unit the file names are what they are.
                 warnings.simplefilter("ignore", UnitWarning)
             map_name = crs if is_geographic else common_system({"crs": crs, str(location): declared_crs})
@@ -168,7 +158,7 @@ def read_trajectory(path: str | os.PathLike[str], *, crs: str | None = None) -> 
         raise ValueError(f"{path}: line {numbers[0]} and following: {error}") from error
 
 
-def _header(path: Path, lines: list[str]) -> tuple[int, str, dict[str, _Column]]:
+def _header(path: Path, lines: list[str]) -> tuple[int, str, dict[str, Column]]:
     """Return the index of the line that names the columns, the delimiter, and the columns in use."""
     data = [i for i, line in enumerate(lines) if line.strip() and not line.lstrip().startswith("#")]
     if not data:
@@ -181,51 +171,31 @@ def _header(path: Path, lines: list[str]) -> tuple[int, str, dict[str, _Column]]
             head -= 1
         lines[head] = lines[head].lstrip().lstrip("#")
     delimiter = max(",;\t ", key=lambda d: (lines[head].count(d) > 0, d != " ", lines[head].count(d)))
-    names = [_NAME_AND_UNIT.match(cell) for cell in _cells(path, head + 1, lines[head], delimiter)]
-    other_times = [match[0].strip() for match in names if match is not None and _is_other_time(match)]
-    columns = {}
-    for quantity, known_names in _NAMES.items():
-        matches = [
-            (i, match[0].strip(), match[2])
-            for i, match in enumerate(names)
-            if match is not None and not _is_other_time(match) and _plain(match[1]) in known_names
-        ]
-        if len(matches) > 1:
-            raise ValueError(
-                f"{path}: line {head + 1}: {quantity} may be any of the columns "
-                f"{', '.join(repr(name) for _, name, _ in matches)}; rename all but one"
-            )
-        if matches:
-            index, name, unit = matches[0]
-            size = _unit(f"{path}: line {head + 1}", quantity, name, unit)
-            columns[quantity] = _Column(index, name, size, unit is not None)
-    if "time" not in columns and other_times:
+    location = f"{path}: line {head + 1}"
+    names = [cell.strip() for cell in _cells(path, head + 1, lines[head], delimiter)]
+    other_times = [name for name in names if _OTHER_TIME.search(re.sub(r"[\[\]()]", "", plain_name(name)))]
+    columns = match_columns(location, ["" if name in other_times else name for name in names], _NAMES)
+    if "time" in columns:
+        if (columns["time"].unit or "").lower() in _SECONDS:
+            columns["time"] = columns["time"]._replace(unit=None)
+    elif other_times:
         raise ValueError(
-            f"{path}: line {head + 1}: {other_times[0]!r} is not GPS time; admissible is a column of GPS "
-            f"time, whose name may be {', '.join(_NAMES['time'])}"
+            f"{location}: {other_times[0]!r} is not GPS time; admissible is a column of GPS time, whose name "
+            f"may be {', '.join(_NAMES['time'])}"
         )
-    read = {column.index for column in columns.values()}
-    unread = [match[0].strip() for i, match in enumerate(names) if match is not None and i not in read]
-    missing = {quantity: known for quantity, known in _NAMES.items() if quantity not in columns}
-    for pair in (("x", "y"), ("longitude", "latitude")):
-        if set(pair) <= set(columns):
-            # The other pair is not missing.
-            missing = {
-                q: known for q, known in missing.items() if q not in ("x", "y", "longitude", "latitude")
-            }
-    _check_columns(f"{path}: line {head + 1}", columns)
-    warn_unread_columns(f"{path}: line {head + 1}", unread, missing)
+    # One angle of an attitude is not an attitude; heading alone is.
+    angles = ("roll", "pitch") if ("roll" in columns) != ("pitch" in columns) else ()
+    check_columns(location, names, columns, _NAMES, ("time", "z", *angles))
     return head, delimiter, columns
 
 
 def _declared_in_comments(
-    path: Path, lines: list[str], is_geographic: bool, columns: dict[str, _Column]
-) -> tuple[dict[str, float], str | None]:
-    """Return the metres per unit of columns of lengths, and the system, that comments of a file declare.
+    path: Path, lines: list[str], is_geographic: bool
+) -> tuple[dict[str, float | None], str | None]:
+    """Return the metres per unit of x, y and z, and the system, that comments of a file declare.
 
-    Comments are as "# units: feet" and "# crs: EPSG:2263". A unit beside the name of a column goes before
-    them. A system of the Earth's own, as EPSG:4326, is that of longitude and latitude, and is not returned;
-    that of x and y is returned in metres.
+    Comments are as "# units: feet" and "# crs: EPSG:2263". A system of the Earth's own, as EPSG:4326, is that
+    of longitude and latitude, and is not returned; that of x and y is returned in metres.
 
     **Raises:** ValueError for several units or systems, a unit beside a system of another, and degrees where
     the columns are x and y.
@@ -252,22 +222,7 @@ def _declared_in_comments(
         if horizontal is not None and unit is not None and not units_agree(horizontal, unit):
             raise ValueError(f"{location}: {text}, but the system {declared['crs'][1]} is in another unit")
         horizontal = vertical = unit
-    sizes = {"x": horizontal, "y": horizontal, "z": vertical}
-    return {
-        name: size
-        for name, size in sizes.items()
-        if size is not None and name in columns and not columns[name].is_declared
-    }, crs
-
-
-def _plain(name: str) -> str:
-    """Return a name in lower case, without spaces, underscores, hyphens and dots."""
-    return re.sub(r"[\s_\-.]", "", name.lower())
-
-
-def _is_other_time(name_and_unit: re.Match[str]) -> bool:
-    """Return True for the name of a column of times that are not GPS time."""
-    return _OTHER_TIME.search(re.sub(r"[\[\]()]", "", _plain(name_and_unit[0]))) is not None
+    return {"x": horizontal, "y": horizontal, "z": vertical}, crs
 
 
 def _cells(path: Path, line: int, text: str, delimiter: str) -> list[str]:
@@ -275,34 +230,8 @@ def _cells(path: Path, line: int, text: str, delimiter: str) -> list[str]:
     return split_cells(path, line, re.sub(r"\s+(?=[\[(])", "", text) if delimiter == " " else text, delimiter)
 
 
-def _check_columns(location: str, columns: dict[str, _Column]) -> None:
-    """Refuse columns that are missing, and coordinates of two kinds."""
-    pairs = [pair for pair in (("x", "y"), ("longitude", "latitude")) if set(pair) & set(columns)]
-    if len(pairs) > 1:
-        raise ValueError(f"{location}: columns of a map and longitude and latitude; remove one pair")
-    required = (*_REQUIRED, *(pairs[0] if pairs else ("x", "y")))
-    # One angle of an attitude is not an attitude; heading alone is.
-    if ("roll" in columns) != ("pitch" in columns):
-        required += ("roll", "pitch")
-    for quantity in required:
-        if quantity not in columns:
-            raise ValueError(
-                f"{location}: no column {quantity}; its name may be {', '.join(_NAMES[quantity])}"
-            )
-
-
-def _unit(location: str, quantity: str, name: str, unit: str | None) -> float:
-    """Return the size of a column's unit in m, degrees or s."""
-    kind = {"time": "time", "x": "length", "y": "length", "z": "length"}.get(quantity, "angle")
-    is_named = kind == "time" and unit is not None and _SECONDS.fullmatch(unit)
-    size = 1.0 if is_named else unit_size(kind, f"{location}: {name!r}", unit)
-    if kind == "angle":
-        return float(np.rad2deg(size or np.deg2rad(1.0)))
-    return size or 1.0
-
-
-def _value(path: Path, line: int, column: _Column, cells: list[str]) -> float:
-    value = parse_number(path, line, column.name, cells[column.index]) * column.unit
+def _value(path: Path, line: int, column: Column, cells: list[str]) -> float:
+    value = parse_number(path, line, column.name, cells[column.index])
     if not np.isfinite(value):
         raise ValueError(f"{path}: line {line}: {column.name} is not finite")
     return value

@@ -13,9 +13,9 @@ from jaxtyping import Float
 
 from jaxlidar._fields.checks import check_choice, check_range, warn_user
 from jaxlidar._fields.crs import common_system
+from jaxlidar._fields.units import unit_size
 from jaxlidar.formats.checks import MAX_COORDINATE, FileWarning, column_index, max_unpacked_size
 from jaxlidar.formats.text import parse_integer, parse_number, read_lines, split_cells
-from jaxlidar.formats.units import unit_size
 from jaxlidar.optics.leaf_angles import LeafAngles
 from jaxlidar.scenes.voxels import VoxelMap
 

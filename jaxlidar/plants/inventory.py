@@ -1,21 +1,20 @@
 """Stands from forest inventories: tables with a row for each tree."""
 
-import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
 from jaxlidar._fields.checks import check_integer, check_kind, check_seed, kind_of
-from jaxlidar._fields.columns import warn_unread_columns
+from jaxlidar._fields.columns import check_columns, match_columns
 from jaxlidar.plants.forest import MAX_TREE_HEIGHT
 from jaxlidar.plants.habits import Habit, broadleaf, conifer, grow, shrub, spreading_tree
 from jaxlidar.plants.stand import Stand
 from jaxlidar.plants.tree import Tree
 
 # Names of columns, without case, spaces, underscores and units.
-_NAMES = {
+COLUMNS = {
     "x": ("x", "easting", "east", "e"),
     "y": ("y", "northing", "north", "n"),
     "height": ("height", "treeheight", "totalheight", "h", "ht"),
@@ -25,7 +24,6 @@ _NAMES = {
     "leaf_area": ("leafarea", "la"),
     "species": ("species", "sp", "speciesname"),
 }
-_REQUIRED = ("x", "y", "height")
 # Quantities of a tree that may be missing: the proportions of the habit give them.
 _OPTIONAL_CELLS = ("diameter", "crown")
 # Admissible values, (low, high], in m or m2; low belongs to those of leaf area and coordinates.
@@ -40,9 +38,6 @@ _LIMITS = {
 }
 # No tree is thicker than this fraction of its height: such diameters are in centimetres.
 _MAX_SLENDERNESS = 0.5
-_UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "ft": 0.3048}
-# A name, and a unit in brackets or after an underscore.
-_NAME_AND_UNIT = re.compile(r"\s*(.*?)\s*(?:[\[(]\s*([^\])]*?)\s*[\])]|_(m|cm|mm|ft|m2))?\s*$")
 
 
 class Inventory(NamedTuple):
@@ -125,12 +120,21 @@ def stand_from_inventory(
     >>> [f"{tree.height:.1f} m at {tree.base[0]:.1f}" for tree in stand]
     ['2.0 m at 2.0', '2.6 m at 6.5']
     """
-    trees = inventory if isinstance(inventory, Inventory) else inventory_of_table(inventory)
+    table: Any = inventory
+    crs = None
     if isinstance(inventory, Inventory):
         # Checked as any other table.
-        columns = inventory._replace(crs=None)._asdict().items()
-        trees = inventory_of_table({name: column for name, column in columns if column is not None})
-        trees = trees._replace(crs=inventory.crs)
+        columns, crs = inventory._replace(crs=None)._asdict(), inventory.crs
+        table = {name: column for name, column in columns.items() if column is not None}
+    if not hasattr(table, "keys") or not hasattr(table, "__getitem__"):
+        raise TypeError(
+            f"inventory is {kind_of(table)}; admissible is a table by columns, such as a dict of lists, a "
+            "DataFrame, or what jaxlidar.io.read_inventory returns"
+        )
+    names = list(table.keys())
+    trees = inventory_of_columns(
+        "the inventory", [str(name) for name in names], [list(table[name]) for name in names]
+    )
     if (leaf_area_index is None) != (area is None):
         raise ValueError("leaf_area_index and area belong together: give both or neither")
     if leaf_area_index is not None and trees.leaf_area is not None:
@@ -151,7 +155,7 @@ def stand_from_inventory(
         copies,
         turn_rng.uniform(0.0, 360.0, n),
         _scales(trees, grown, copies),
-        crs=trees.crs,
+        crs=crs,
     )
     if leaf_area_index is not None and area is not None:
         return stand.with_leaf_area_index(leaf_area_index, area)
@@ -198,87 +202,46 @@ def _habits_by_species(habits: Any, trees: Inventory) -> Mapping[str, Habit]:
     return habits
 
 
-def inventory_of_table(table: Any, place_of: Callable[[int], str] = "row {}".format) -> Inventory:
-    """Return the inventory of a table by columns, with lengths in m.
+def inventory_of_columns(
+    location: str, names: Sequence[str], cells: Sequence[Sequence[Any]], places: Sequence[str] | None = None
+) -> Inventory:
+    """Return the inventory of a table, with lengths in m.
 
-    **Arguments:**
+    **Arguments:** `location`: the table, for messages. `names`, `cells`: of each column. `places`: of the
+    rows, for messages. Default None: "row 0" and so on.
 
-    - `table`: a mapping of columns, or a DataFrame.
-    - `place_of`: describes the place of a row, for messages, by its number from 0. Default: "row 3".
-
-    **Raises:** ValueError and TypeError as `stand_from_inventory`.
+    **Raises:** ValueError as `stand_from_inventory`.
     """
-    if not hasattr(table, "keys") or not hasattr(table, "__getitem__"):
-        raise TypeError(
-            f"inventory is {kind_of(table)}; admissible is a table by columns, such as a dict of lists, a "
-            "DataFrame, or what jaxlidar.io.read_inventory returns"
-        )
-    table_names = [str(name) for name in table.keys()]  # noqa: SIM118
-    names, units = columns_in_use(table_names)
-    missing = {quantity: known for quantity, known in _NAMES.items() if quantity not in names}
-    warn_unread_columns("the inventory", [n for n in table_names if n not in names.values()], missing)
-    labels = {str(label): label for label in table.keys()}  # noqa: SIM118
-    cells = {quantity: list(table[labels[name]]) for quantity, name in names.items()}
-    n = len(cells["x"])
-    for quantity, column in cells.items():
-        if len(column) != n:
-            raise ValueError(f"column {names[quantity]!r} has {len(column)} rows; x has {n}")
+    columns = match_columns(location, names, COLUMNS)
+    check_columns(location, names, columns, COLUMNS, ("height",))
+    n = len(cells[columns["x"].index])
+    for column in columns.values():
+        if len(cells[column.index]) != n:
+            raise ValueError(f"column {column.name!r} has {len(cells[column.index])} rows; x has {n}")
     if n == 0:
-        raise ValueError("the inventory has no row; admissible is one or more")
-    columns: dict[str, Any] = {}
-    for quantity, column in cells.items():
+        raise ValueError(f"{location}: there is no row; admissible is one or more")
+    places = places or [f"row {i}" for i in range(n)]
+    quantities: dict[str, Any] = {}
+    for quantity, (i, name, _) in columns.items():
+        rows = list(zip(places, cells[i]))
         if quantity == "species":
-            columns[quantity] = tuple(_species(place_of(i), cell) for i, cell in enumerate(column))
+            quantities[quantity] = tuple(_species(place, cell) for place, cell in rows)
         else:
-            unit, name = units[quantity], names[quantity]
-            columns[quantity] = np.array(
-                [_quantity(place_of(i), name, quantity, cell, unit) for i, cell in enumerate(column)]
+            unit = columns[quantity].size(location, "area" if quantity == "leaf_area" else "length")
+            quantities[quantity] = np.array(
+                [_quantity(place, name, quantity, cell, unit) for place, cell in rows]
             )
-    inventory = Inventory(**columns)
+    inventory = Inventory(**quantities)
     if inventory.diameter is not None:
         thick = np.flatnonzero(inventory.diameter > _MAX_SLENDERNESS * inventory.height)
         if thick.size:
-            i, name = int(thick[0]), names["diameter"]
+            i, name = int(thick[0]), columns["diameter"].name
             raise ValueError(
-                f"{place_of(i)}: {name} = {inventory.diameter[i]:g} m of a tree of "
+                f"{places[i]}: {name} = {inventory.diameter[i]:g} m of a tree of "
                 f"{inventory.height[i]:g} m; admissible is up to {_MAX_SLENDERNESS:g} of the height. A "
                 "column in centimetres is named 'diameter [cm]'"
             )
     return inventory
-
-
-def columns_in_use(names: list[str]) -> tuple[dict[str, str], dict[str, float]]:
-    """Return the names of the columns by quantity, and their units in m or m2.
-
-    **Raises:** ValueError for columns that are missing or ambiguous, and units that are not known.
-    """
-    matches: dict[str, list[tuple[str, str]]] = {}
-    for name in names:
-        match = _NAME_AND_UNIT.match(name)
-        assert match is not None
-        bare = re.sub(r"[\s_\-.]", "", match[1].lower())
-        for quantity, admissible in _NAMES.items():
-            if bare in admissible:
-                matches.setdefault(quantity, []).append((name, (match[2] or match[3] or "").lower()))
-    for quantity in _REQUIRED:
-        if quantity not in matches:
-            raise ValueError(
-                f"the inventory has no column {quantity}; its name may be {', '.join(_NAMES[quantity])}. "
-                f"There are {', '.join(names)}"
-            )
-    units = {}
-    for quantity, columns in matches.items():
-        if len(columns) > 1:
-            raise ValueError(
-                f"{quantity} may be any of the columns {', '.join(repr(name) for name, _ in columns)}; "
-                "remove or rename all but one"
-            )
-        ((name, unit),) = columns
-        admissible_units = {"m2": 1.0} if quantity == "leaf_area" else _UNITS
-        if quantity != "species" and unit and unit not in admissible_units:
-            raise ValueError(f"column {name!r}: admissible units are {', '.join(admissible_units)}")
-        units[quantity] = admissible_units.get(unit, 1.0)
-    return {quantity: columns[0][0] for quantity, columns in matches.items()}, units
 
 
 def _species(place: str, cell: Any) -> str:

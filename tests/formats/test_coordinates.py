@@ -19,7 +19,7 @@ import pytest
 import jaxlidar as jl
 from jaxlidar import cli
 from jaxlidar._fields.crs import directions_of_north, system_of_name, transform
-from jaxlidar.formats.units import unit_size
+from jaxlidar._fields.units import unit_size
 from jaxlidar.io import (
     read_dem,
     read_gedi_l1b,
@@ -824,7 +824,7 @@ def test_units_of_tree_models(tmp_path):
     tree, _ = read_qsm(path)
     assert (tree.height, tree.trunk_diameter) == (pytest.approx(2.0), pytest.approx(0.2))
     path.write_text(f"{names.replace('mm', 'span')}\n1,-1,0,0,0,0,0,200,100\n")
-    with pytest.raises(ValueError, match="line 1: radius: the unit"):
+    with pytest.raises(ValueError, match=r"line 1: .radius \(span\).: the unit"):
         read_qsm(path)
 
 

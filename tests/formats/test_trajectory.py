@@ -98,7 +98,7 @@ def test_times_that_are_not_gps_time_are_refused(tmp_path, column):
         (f"{HEAD}\n100,1,2,inf,4,5,6\n", "line 2: Height is not finite"),
         (f"{HEAD}\n100,1,2,3,4,95,6\n", "pitch"),
         (f"{HEAD}\n100,1,2,3,4,5,6\n99,1,2,3,4,5,6\n", "rise strictly"),
-        ("time (weeks),x,y,z\n0,0,0,0\n", r"line 1: .time \(weeks\).: the unit .\(weeks\). is not known"),
+        ("time (weeks),x,y,z\n0,0,0,0\n", r"line 1: .time \(weeks\).: the unit .weeks. is not known"),
         ("time,x,y,z (parsec)\n0,0,0,0\n", "z"),
     ],
 )

@@ -55,7 +55,7 @@ def test_places_are_read_from_maps_and_from_longitude_and_latitude(tmp_path):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("", "line 1: no column longitude"),
+        ("", "line 1: there is no line that names"),
         ("x,z\n1,2\n", "line 1: no column y; .* there are x, z"),
         ("x,y\n", "line 2: no footprint"),
         ("x,y\n1,2\n3\n", "line 3: 1 values; the header names 2"),

@@ -171,9 +171,12 @@ def test_a_pandas_table_is_an_inventory():
         ({"leaf_area": [1.0, -1.0, 1.0]}, "row 1: leaf_area = -1 m2 is outside"),
         ({"y": [1.0, 2.0]}, "column 'y' has 2 rows; x has 3"),
         ({"easting": [1.0, 2.0, 3.0]}, "x may be any of the columns 'x', 'easting'"),
-        ({"crown [acres]": [1.0, 2.0, 3.0], "crown_diameter": None}, "admissible units are m, cm, mm, ft"),
-        ({"height": None}, "the inventory has no column height; its name may be height, treeheight"),
-        ({name: [] for name in TABLE}, "the inventory has no row"),
+        (
+            {"crown [acres]": [1.0, 2.0, 3.0], "crown_diameter": None},
+            "the unit 'acres' is not known",
+        ),
+        ({"height": None}, "the inventory: no column height; its name may be height, treeheight"),
+        ({name: [] for name in TABLE}, "the inventory: there is no row"),
     ],
 )
 def test_bad_rows_are_named_with_row_and_column(changes, message):
@@ -188,8 +191,8 @@ def test_bad_rows_are_named_with_row_and_column(changes, message):
         ("x,y,height\n1,2,3\n1,2\n", "plot.csv: line 3: 2 values; the header names 3"),
         ("x,y,height\n\n1,2,low\n", "plot.csv: line 3: height = 'low' is no number"),
         ("x,y,height,dbh\n1,2,20,35\n", "plot.csv: line 2: dbh = 35 m is outside"),
-        ("x,y,dbh\n1,2,3\n", "plot.csv: line 1: the inventory has no column height"),
-        ("x,y,x,height\n1,2,3,4\n", "plot.csv: line 1: 2 columns have the name 'x'"),
+        ("x,y,dbh\n1,2,3\n", "plot.csv: line 1: no column height"),
+        ("x,y,x,height\n1,2,3,4\n", "plot.csv: line 1: x may be any of the columns 'x', 'x'"),
         ("", "plot.csv: line 1: there is no line"),
     ],
 )

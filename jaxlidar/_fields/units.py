@@ -1,4 +1,4 @@
-"""Units that files name: their sizes in m, rad and s."""
+"""Units that files name: their sizes in m, m2, rad and s."""
 
 import contextlib
 import math
@@ -31,16 +31,17 @@ _TIME_NAMES = {
     3600.0: ("hour", "hr", "h"),
     86400.0: ("day", "d"),
 }
+_BY_KIND = {"length": _LENGTH_NAMES, "area": {1.0: ("m2",)}, "angle": _ANGLE_NAMES, "time": _TIME_NAMES}
 _SIZES = {
     kind: {name: size for size, names in names_by_size.items() for name in names}
-    for kind, names_by_size in (("length", _LENGTH_NAMES), ("angle", _ANGLE_NAMES), ("time", _TIME_NAMES))
+    for kind, names_by_size in _BY_KIND.items()
 }
 
 
 def unit_size(kind: str, location: str, unit: str | None) -> float | None:
-    """Return the size in m, rad or s of a unit that a file names, such as "cm" or "0.01 m"; None without one.
+    """Return the size in m, m2, rad or s of a unit that a file names, as "cm" or "0.01 m"; None without one.
 
-    **Arguments:** `kind`: "length", "angle" or "time". `location`: in the file, for messages.
+    **Arguments:** `kind`: "length", "area", "angle" or "time". `location`: in the file, for messages.
 
     **Raises:** ValueError for an unknown unit.
     """
