@@ -273,6 +273,36 @@ def check_shape(field: str, x: Any, *shapes: tuple[int, ...]) -> None:
         raise ValueError(f"{field} has shape {np.shape(x)}; admissible is {admissible}")
 
 
+def checked_array(
+    field: str,
+    x: Any,
+    shape: tuple[int | None, ...],
+    low: float = -np.inf,
+    high: float = np.inf,
+    *,
+    one_for_all: bool = False,
+    **limits: bool,
+) -> Float[np.ndarray, "..."]:
+    """Convert numbers in a range, given as for `check_range`, to a new NumPy array of float64 of one shape.
+
+    **Arguments:** `shape`: None in it stands for any number of rows, one or more. `one_for_all`: True where
+    one number may stand for all.
+
+    **Raises:** as `check_range`, `as_numpy` and `check_shape`.
+    """
+    check_range(field, x, low, high, **limits)
+    array = as_numpy(x, field)
+    if one_for_all and array.ndim == 0:
+        return np.full(shape, array)
+    if array.ndim == len(shape):
+        shape = tuple(max(m, 1) if n is None else n for m, n in zip(array.shape, shape))
+    if array.shape != shape:
+        rows = str(shape).replace("None", "n")
+        admissible = f"one number or {rows}" if one_for_all else rows
+        raise ValueError(f"{field} has shape {array.shape}; admissible is {admissible}")
+    return array.copy()
+
+
 def check_integer(field: str, x: Any, low: int = 1, high: float = np.inf) -> int:
     """Convert a whole number from `low` to `high` to an int.
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from jaxlidar._fields.checks import check_integer, check_range, check_shape
+from jaxlidar._fields.checks import check_integer, check_shape, checked_array
 
 # Tolerance, in voxels, for coordinates that rounding has moved across a face of the grid.
 _ROUNDING = 1e-9
@@ -33,11 +33,9 @@ class Grid:
             first = np.floor(low / size + _ROUNDING)
             count = np.maximum(np.ceil(high / size - _ROUNDING) - first, 1)
             return Grid(first * size, size, tuple(int(n) for n in count))
-        check_range("origin", origin)
-        check_shape("origin", origin, (3,))
-        check_range("shape", shape, 1)
+        low_corner = checked_array("origin", origin, (3,))
         check_shape("shape", shape, (3,))
-        grid = Grid(np.asarray(origin, float), size, tuple(check_integer("shape", n) for n in shape))
+        grid = Grid(low_corner, size, tuple(check_integer("shape", n) for n in shape))
         top = grid.low + size * grid.shape
         if np.any(low < grid.low - _ROUNDING * size) or np.any(high > top + _ROUNDING * size):
             arguments = f"origin = {tuple(grid.low.tolist())} and shape = {grid.shape}"
@@ -67,6 +65,4 @@ class Grid:
 
 def voxel_edges(voxel_size: float | tuple[float, float, float]) -> np.ndarray:
     """The edges of a voxel along x, y and z, of one number or three. **Raises:** as `jaxlidar.voxelise`."""
-    check_range("voxel_size", voxel_size, 0.0, low_open=True)
-    check_shape("voxel_size", voxel_size, (), (3,))
-    return np.broadcast_to(np.asarray(voxel_size, float), (3,)).copy()
+    return checked_array("voxel_size", voxel_size, (3,), 0.0, one_for_all=True, low_open=True)

@@ -7,7 +7,7 @@ from typing import Any, final, overload
 import numpy as np
 from jaxtyping import Float, Int
 
-from jaxlidar._fields.checks import Numbers, check_kind, check_number, check_range, check_shape
+from jaxlidar._fields.checks import Numbers, check_kind, check_number, check_range, check_shape, checked_array
 from jaxlidar._fields.crs import common_system, crs_name
 from jaxlidar.plants.tree import Tree
 from jaxlidar.scenes.terrain import Terrain
@@ -73,10 +73,7 @@ class Stand(Sequence[Tree]):
             check_kind("one of individuals", tree, Tree, "a Tree")
         if not trees:
             raise ValueError("individuals is empty; at least one tree is admissible")
-        check_range("position", position)
-        place = np.asarray(position, float)
-        if place.ndim != 2 or place.shape[1] != 3 or len(place) == 0:
-            raise ValueError(f"position has shape {place.shape}; admissible is (n, 3), with one copy or more")
+        place = checked_array("position", position, (None, 3))
         n = len(place)
         number = np.zeros(n, int)
         if individual is not None:
@@ -84,24 +81,14 @@ class Stand(Sequence[Tree]):
             number = np.asarray(individual)
             if not np.issubdtype(number.dtype, np.integer):
                 raise TypeError(f"individual is an array of {number.dtype}; admissible are integers")
-        turn, factors = np.zeros(n), np.ones((n, 3))
-        if azimuth is not None:
-            check_range("azimuth", azimuth)
-            turn = np.asarray(azimuth, float)
+            check_shape("individual", number, (n,))
+        turn = np.zeros(n) if azimuth is None else checked_array("azimuth", azimuth, (n,))
+        factors = np.ones((n, 3))
         if scale is not None:
-            check_range("scale", scale, 0.0, low_open=True)
-            factors = np.asarray(scale, float)
+            factors = checked_array("scale", scale, (n, 3), 0.0, low_open=True)
         area = None
         if leaf_area is not None:
-            check_range("leaf_area", leaf_area, 0.0)
-            check_shape("leaf_area", leaf_area, (), (n,))
-            area = np.broadcast_to(np.asarray(leaf_area, float), (n,)).copy()
-        for name, array, shape in (
-            ("individual", number, (n,)),
-            ("azimuth", turn, (n,)),
-            ("scale", factors, (n, 3)),
-        ):
-            check_shape(name, array, shape)
+            area = checked_array("leaf_area", leaf_area, (n,), 0.0, one_for_all=True)
         # Each individual is scaled and turned about its base.
         copied = tuple(tree.translated(-tree.base) for tree in trees)
         values = (copied, place, number, turn, factors, area, crs_name(crs))
@@ -218,9 +205,7 @@ class Stand(Sequence[Tree]):
         **Raises:** ValueError for areas of another number or sign, and for a tree that has a leaf area and no
         leaf clumps.
         """
-        check_range("area", area, 0.0)
-        check_shape("area", area, (len(self),))
-        areas, counts = np.asarray(area, float), self._clump_counts()
+        areas, counts = checked_array("area", area, (len(self),), 0.0), self._clump_counts()
         bare = np.flatnonzero((counts == 0) & (areas > 0))
         if bare.size:
             raise ValueError(

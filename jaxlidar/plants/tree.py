@@ -8,7 +8,7 @@ import numpy as np
 import scipy
 from jaxtyping import Bool, Float, Int
 
-from jaxlidar._fields.checks import check_kind, check_number, check_range, check_shape
+from jaxlidar._fields.checks import check_kind, check_number, check_range, check_shape, checked_array
 
 
 @final
@@ -200,9 +200,7 @@ class Tree:
 
         **Raises:** ValueError for an offset that is not finite or not three numbers.
         """
-        check_range("offset", offset)
-        check_shape("offset", offset, (3,))
-        d = np.asarray(offset, dtype=float)
+        d = checked_array("offset", offset, (3,))
         return replace(self, start=self.start + d, end=self.end + d, bud_position=self.bud_position + d)
 
     def rotated(self, angle: float) -> "Tree":
@@ -240,9 +238,9 @@ class Tree:
 
         **Raises:** ValueError for a factor that is not positive, and for another number of factors.
         """
-        check_range("factor", factor, 0.0, low_open=True)
-        check_shape("factor", factor, (), (3,))
-        horizontal, vertical, radial = np.broadcast_to(np.asarray(factor, float), (3,))
+        horizontal, vertical, radial = checked_array(
+            "factor", factor, (3,), 0.0, one_for_all=True, low_open=True
+        )
         stretch = np.array([horizontal, horizontal, vertical])
         return replace(
             self,

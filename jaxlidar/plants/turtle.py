@@ -27,7 +27,7 @@ from math import cos, radians, sin, sqrt
 
 import numpy as np
 
-from jaxlidar._fields.checks import check_kind, check_number, check_range, check_shape
+from jaxlidar._fields.checks import check_kind, check_number, check_range, checked_array
 from jaxlidar.plants.lsystem import Item, Word
 from jaxlidar.plants.tree import Tree
 
@@ -107,10 +107,8 @@ def turtle(
     check_number("length", length)
     check_number("radius", radius, 0.0, low_open=True)
     check_number("bud_radius", bud_radius, 0.0, low_open=True)
-    check_range("position", position)
-    check_shape("position", position, (3,))
+    x, y, z = checked_array("position", position, (3,)).tolist()
     frame = _frame(heading, left)
-    x, y, z = map(float, position)
     # `branching`: the next segment begins a branch.
     parent, order, branching = -1, 0, False
     # Plain numbers in flat lists and no calls: this loop takes most of the time that a tree takes.
@@ -197,12 +195,10 @@ def turtle(
 
 def _frame(heading: Vector, left: Vector) -> list[Vector]:
     """Heading, left and up, made orthonormal. **Raises:** as `turtle`."""
-    for name, value in (("heading", heading), ("left", left)):
-        check_range(name, value)
-        check_shape(name, value, (3,))
+    H, L = checked_array("heading", heading, (3,)), checked_array("left", left, (3,))
+    for name, value in (("heading", H), ("left", L)):
         check_range(f"length of {name}", np.linalg.norm(value), 0.0, low_open=True)
-    H = np.asarray(heading, dtype=float) / np.linalg.norm(heading)
-    L = np.asarray(left, dtype=float) / np.linalg.norm(left)
+    H, L = H / np.linalg.norm(H), L / np.linalg.norm(L)
     L = L - (L @ H) * H
     if np.linalg.norm(L) < 1e-9:
         raise ValueError(f"left = {tuple(left)} is along the heading; any other direction is admissible")

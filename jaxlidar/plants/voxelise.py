@@ -35,8 +35,8 @@ from jaxlidar._fields.checks import (
     check_integer,
     check_kind,
     check_number,
-    check_range,
     check_shape,
+    checked_array,
     kind_of,
 )
 from jaxlidar.plants.grid import Grid, voxel_edges
@@ -343,10 +343,7 @@ def voxelise_points(
     >>> print(voxels.shape, f"{float(2 * voxels.leaf.sum()) * 0.5**3:.2f} m2")
     (4, 4, 4) 6.00 m2
     """
-    check_range("points", points)
-    points = np.asarray(points, float)
-    if points.ndim != 2 or points.shape[1] != 3 or len(points) == 0:
-        raise ValueError(f"points has shape {points.shape}; admissible is (n, 3), with one point or more")
+    points = checked_array("points", points, (None, 3))
     check_number("leaf_area", leaf_area, 0.0)
     check_number("wood_probability", wood_probability, 0.0, 1.0)
     min_points = check_integer("min_points", min_points)

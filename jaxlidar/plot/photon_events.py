@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import ArrayLike
 from matplotlib.axes import Axes
 
-from jaxlidar._fields.checks import check_kind, check_range, check_shape, concrete_array
+from jaxlidar._fields.checks import check_kind, checked_array
 from jaxlidar.formats.icesat2 import PhotonTrack
 from jaxlidar.plot.style import MATERIAL_COLOURS, OTHER_COLOUR, TOTAL_COLOUR, make_axes
 from jaxlidar.sensors.photon_counter import PhotonEvents
@@ -77,15 +77,11 @@ def photons(
     else:
         position = np.arange(len(events.lost), dtype=float)
         if distance is not None:
-            check_range("distance", distance)
-            check_shape("distance", distance, position.shape)
-            position = concrete_array(distance)
+            position = checked_array("distance", distance, position.shape)
         x, is_signal = position[events.shot], events.signal
     labels = np.where(is_signal, 3, 0)
     if label is not None:
-        check_range("label", label, 0, 3)
-        check_shape("label", label, labels.shape)
-        labels = concrete_array(label)
+        labels = checked_array("label", label, labels.shape, 0, 3)
     ax = make_axes(ax, (7.4, 3.4))
     points = {"marker": "o", "markeredgewidth": 0, "linestyle": "none"}
     for number, (name, colour, size) in _LABELS.items():

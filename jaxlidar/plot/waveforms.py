@@ -8,13 +8,12 @@ from matplotlib.axes import Axes
 from matplotlib.patches import Patch
 
 from jaxlidar._fields.checks import (
-    as_numpy,
     check_choice,
     check_kind,
     check_number,
     check_numbers,
     check_range,
-    check_shape,
+    checked_array,
 )
 from jaxlidar.plot.style import (
     BEAM_COLOUR,
@@ -207,9 +206,7 @@ def waterfall(
     if distance is None:
         places = _distance_along_track(waves, rows)
     else:
-        check_range("distance", distance)
-        check_shape("distance", distance, rows.shape)
-        places = as_numpy(distance, "distance")
+        places = checked_array("distance", distance, rows.shape)
     power = np.asarray(getattr(waves, quantity)[rows, w], float)
     largest = float(power.max())
     gaps = np.diff(np.sort(places))

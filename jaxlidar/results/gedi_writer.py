@@ -29,6 +29,7 @@ from jaxlidar._fields.checks import (
     check_numbers,
     check_range,
     check_shape,
+    checked_array,
     concrete_number,
     required_for,
 )
@@ -162,9 +163,7 @@ def write_gedi_l1b(
     parts = _parts(waveforms)
     first_time, bins = _spans(parts, survey, margin)
     shots = len(survey)
-    check_range("elevation", elevation)
-    check_shape("elevation", elevation, (), (shots,))
-    plane_elevation = np.broadcast_to(np.asarray(elevation, float), (shots,))
+    plane_elevation = checked_array("elevation", elevation, (shots,), one_for_all=True)
     beams = np.array([beam] * shots if isinstance(beam, str) else list(beam))
     check_shape("beam", beams, (shots,))
     for name in np.unique(beams):
@@ -172,8 +171,7 @@ def write_gedi_l1b(
     check_number("gain", gain, 0.0, low_open=True)
     check_number("noise_mean", noise_mean, 0.0)
     check_number("noise_std", noise_std, 0.0)
-    check_range("solar_elevation", solar_elevation, -90.0, 90.0)
-    check_shape("solar_elevation", solar_elevation, (), (shots,))
+    sun = checked_array("solar_elevation", solar_elevation, (shots,), -90.0, 90.0, one_for_all=True)
     if key is not None:
         check_key(key)
     per_joule = gain / _energy_per_reflectance(survey)
@@ -202,7 +200,7 @@ def write_gedi_l1b(
         crs = common_system({"survey": survey.crs, "crs": crs})
     projection = _projection(origin, crs)
     geolocation = _geolocation(survey, first_time, bins, plane_elevation, projection)
-    geolocation["solar_elevation"] = np.broadcast_to(np.asarray(solar_elevation, np.float32), (shots,))
+    geolocation["solar_elevation"] = sun.astype(np.float32)
     # Samples of 1 ns from the transmission to the first received one; the second number has 16 bits.
     first_sample = np.rint(2e9 * geolocation["bounce_time_offset_bin0"] + pulse_zero).astype(np.int64)
     rx_offset = np.minimum(first_sample, _RX_OFFSET)

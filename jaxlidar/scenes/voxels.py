@@ -21,11 +21,11 @@ from jaxtyping import Array, ArrayLike, Float, Int
 from jaxlidar._fields.checks import (
     Magnitude,
     as_array,
-    as_numpy,
     as_optional_array,
     check_kind,
     check_range,
     check_shape,
+    checked_array,
     concrete,
     concrete_array,
     coordinates,
@@ -365,9 +365,7 @@ class VoxelMap(eqx.Module):
                     f"maps[{number}].leaf_angles differ from those of maps[0]; admissible are equal"
                 )
         crs = common_system({f"maps[{number}]": voxels.crs for number, voxels in enumerate(maps)})
-        check_range("azimuth", azimuth)
-        check_shape("azimuth", azimuth, (), (len(maps),))
-        turns = np.broadcast_to(as_numpy(azimuth, "azimuth"), (len(maps),))
+        turns = checked_array("azimuth", azimuth, (len(maps),), one_for_all=True)
         sizes = np.array([concrete_array(voxels.voxel_size) for voxels in maps], float)
         size = sizes.min(axis=0)
         if voxel_size is not None:

@@ -33,7 +33,7 @@ from jaxlidar._fields.checks import (
     check_kind,
     check_number,
     check_range,
-    check_shape,
+    checked_array,
     concrete_array,
     concrete_number,
     kind_of,
@@ -45,7 +45,7 @@ from jaxlidar._registry import shots_within
 from jaxlidar._text import number_text
 from jaxlidar.sensors.lidar import AIM_DISTANCE, Lidar
 from jaxlidar.sensors.scan import MAX_ZENITH, STRAIGHT_UP, AbstractScan, Panorama
-from jaxlidar.sensors.trajectory import Trajectory, body_rotation, rotation_matrix, three_numbers
+from jaxlidar.sensors.trajectory import Trajectory, body_rotation, rotation_matrix
 
 # A length that falls short of a multiple of the spacing by this fraction, as by rounding, counts as the
 # multiple.
@@ -159,31 +159,30 @@ class Survey(eqx.Module):
                     "position is given, but the lidar has no altitude; admissible is sensor, or altitude"
                 )
         self.position = position
-        self.altitude = None if altitude is None else _per_shot("altitude", altitude, shots)
-        if self.altitude is not None:
-            check_range("altitude", self.altitude, 0.0, low_open=True)
+
+        def per_shot(field: str, x: Any, low: float = -np.inf, high: float = np.inf, **limits: bool) -> Any:
+            return checked_array(field, x, (shots,), low, high, one_for_all=True, **limits)
+
+        def optional_per_shot(field: str, x: Any, *limits: float) -> Any:
+            return None if x is None else per_shot(field, x, *limits)
+
+        self.altitude = None if altitude is None else per_shot("altitude", altitude, 0.0, low_open=True)
         # The lidar is of the same kind as its shots, so that these share its compiled programs.
         self.lidar = _of_kind(lidar, has_sensors)
-        self.zenith = _per_shot("zenith", lidar.zenith if zenith is None else zenith, shots)
-        self.azimuth = _per_shot("azimuth", lidar.azimuth if azimuth is None else azimuth, shots)
-        check_range("zenith", self.zenith, 0.0, STRAIGHT_UP if has_sensors else MAX_ZENITH)
-        self.gps_time = _optional_per_shot("gps_time", gps_time, shots)
-        self.scan_angle = _optional_per_shot("scan_angle", scan_angle, shots)
-        lines = _optional_per_shot("flight_line", flight_line, shots)
-        if self.scan_angle is not None:
-            check_range("scan_angle", self.scan_angle, -180.0, 180.0)
-        if lines is not None:
-            check_range("flight_line", lines, 0, MAX_FLIGHT_LINE)
-            if np.any(lines != np.floor(lines)):
-                raise ValueError("flight_line has values that are not whole numbers")
+        max_zenith = STRAIGHT_UP if has_sensors else MAX_ZENITH
+        self.zenith = per_shot("zenith", lidar.zenith if zenith is None else zenith, 0.0, max_zenith)
+        self.azimuth = per_shot("azimuth", lidar.azimuth if azimuth is None else azimuth)
+        self.gps_time = optional_per_shot("gps_time", gps_time)
+        self.scan_angle = optional_per_shot("scan_angle", scan_angle, -180.0, 180.0)
+        lines = optional_per_shot("flight_line", flight_line, 0, MAX_FLIGHT_LINE)
+        if lines is not None and np.any(lines != np.floor(lines)):
+            raise ValueError("flight_line has values that are not whole numbers")
         self.flight_line = None if lines is None else lines.astype(int)
-        self.attitude = _optional_rows("attitude", attitude, (shots, 3))
-        self.ellipse_turn = _optional_per_shot("ellipse_turn", ellipse_turn, shots)
-        if self.ellipse_turn is not None:
-            check_range("ellipse_turn", self.ellipse_turn, -360.0, 360.0)
-            if lidar.level_divergence is None:
-                raise ValueError("ellipse_turn is given, but the beam of lidar is round; admissible is None")
-        self.stated = _optional_rows("stated", stated, (shots, 6))
+        self.attitude = None if attitude is None else checked_array("attitude", attitude, (shots, 3))
+        self.ellipse_turn = optional_per_shot("ellipse_turn", ellipse_turn, -360.0, 360.0)
+        if self.ellipse_turn is not None and lidar.level_divergence is None:
+            raise ValueError("ellipse_turn is given, but the beam of lidar is round; admissible is None")
+        self.stated = None if stated is None else checked_array("stated", stated, (shots, 6))
         if self.stated is not None and not has_sensors:
             raise ValueError("stated is given with position; admissible is sensor, or stated = None")
 
@@ -349,7 +348,7 @@ class Survey(eqx.Module):
 
     def relative_to(self, origin: Float[np.ndarray, "2"]) -> "Survey":
         """Make the same survey with positions relative to `origin`, (2,) x and y in m."""
-        origin = _horizontal_position("origin", origin)
+        origin = checked_array("origin", origin, (2,))
         shift = np.pad(origin, (0, self.position.shape[1] - 2))
         moved = eqx.tree_at(lambda s: s.position, self, self.position - shift)
         if self.stated is None:
@@ -402,9 +401,10 @@ class Survey(eqx.Module):
         >>> print(jl.ground_position(true, jl.Scene(ground=jl.Ground()))[0, :2].round(3))
         [-0.105  0.   ]
         """
-        turn = three_numbers("boresight", boresight)
+        turn = checked_array("boresight", boresight, (3,))
         deviations = {
-            name: _three_deviations(name, x) for name, x in (("position", position), ("attitude", attitude))
+            name: checked_array(name, x, (3,), 0.0, one_for_all=True)
+            for name, x in (("position", position), ("attitude", attitude))
         }
         check_number("range", range, 0.0)
         is_random = float(range) > 0 or any(deviation.any() for deviation in deviations.values())
@@ -558,14 +558,10 @@ class Survey(eqx.Module):
         >>> survey.position.tolist()
         [[0.0, 0.0], [10.0, 0.0], [20.0, 0.0], [0.0, 10.0], [10.0, 10.0], [20.0, 10.0]]
         """
-        first, last = _horizontal_position("low", low), _horizontal_position("high", high)
-        check_range("spacing", spacing, 0.0, low_open=True)
-        step = as_numpy(spacing, "spacing")
-        if step.shape not in ((), (2,)):
-            raise ValueError(f"spacing has shape {step.shape}; admissible is one number or (2,)")
+        first, last = checked_array("low", low, (2,)), checked_array("high", high, (2,))
+        step = checked_array("spacing", spacing, (2,), 0.0, one_for_all=True, low_open=True)
         if np.any(last < first):
             raise ValueError(f"high = {last.tolist()} lies below low = {first.tolist()}")
-        step = np.broadcast_to(step, (2,))
         counts = [_count_along(float(last[k] - first[k]), float(step[k])) for k in range(2)]
         _check_number_of_shots(f"spacing = {step.tolist()}", counts[0] * counts[1])
         x, y = (first[k] + step[k] * np.arange(counts[k]) for k in range(2))
@@ -779,8 +775,8 @@ class Survey(eqx.Module):
         angles = as_numpy(mounting, "mounting")
         if angles.ndim not in (1, 2) or angles.shape[-1] != 3 or angles.size == 0:
             raise ValueError(f"mounting has shape {angles.shape}; admissible is (3,) or (channels, 3)")
-        turns = [rotation_matrix(*three_numbers("mounting", row)) for row in np.atleast_2d(angles)]
-        arm = three_numbers("lever_arm", lever_arm)
+        turns = [rotation_matrix(*checked_array("mounting", row, (3,))) for row in np.atleast_2d(angles)]
+        arm = checked_array("lever_arm", lever_arm, (3,))
         durations = [float(strip.time[-1] - strip.time[0]) for strip in strips]
         if pulse_rate is not None:
             counts = [_count_along(duration, 1.0 / float(pulse_rate)) for duration in durations]
@@ -870,9 +866,8 @@ def _strip(
     order |= {"crs": flight.crs, "attitude": np.stack([flight.roll, flight.pitch, flight.yaw], axis=1)}
     if lidar.level_divergence is not None:
         assert lidar.ellipse_turn is not None
-        level_axis = as_numpy(pattern.level_axis(time), "level_axis of the scan pattern")
-        check_shape("level_axis of the scan pattern", level_axis, (len(time), 3))
-        check_range("level_axis of the scan pattern", level_axis)
+        level_axis = pattern.level_axis(time)
+        level_axis = checked_array("level_axis of the scan pattern", level_axis, (len(time), 3))
         turn_of_lidar = concrete_number(lidar.ellipse_turn)
         order["ellipse_turn"] = (
             _turn_about_beam(zenith, azimuth, to_map(level_axis)) + turn_of_lidar
@@ -977,49 +972,9 @@ def _of_kind(lidar: Lidar, has_sensors: bool) -> Lidar:
     return dataclasses.replace(lidar, position=(0.0, 0.0), altitude=1000.0, zenith=0.0)
 
 
-def _per_shot(field: str, x: Any, shots: int) -> Float[np.ndarray, " shots"]:
-    """Convert one number for all shots, or one for each, to an array with one for each."""
-    check_range(field, x)
-    value = as_numpy(x, field)
-    if value.shape not in ((), (shots,)):
-        raise ValueError(
-            f"{field} has shape {value.shape}; admissible is one number or ({shots},), as position"
-        )
-    return np.broadcast_to(value, (shots,)).copy()
-
-
-def _optional_per_shot(field: str, x: Any, shots: int) -> Float[np.ndarray, " shots"] | None:
-    """Convert as `_per_shot`; None stays None."""
-    return None if x is None else _per_shot(field, x, shots)
-
-
-def _optional_rows(field: str, x: Any, shape: tuple[int, int]) -> Float[np.ndarray, "shots _"] | None:
-    """Convert numbers of a row for each shot; None stays None."""
-    if x is None:
-        return None
-    check_range(field, x)
-    check_shape(field, x, shape)
-    return as_numpy(x, field)
-
-
-def _three_deviations(field: str, x: Any) -> Float[np.ndarray, "3"]:
-    """Return three standard deviations, of which one number stands for all."""
-    check_range(field, x, 0.0)
-    check_shape(field, x, (), (3,))
-    return np.broadcast_to(as_numpy(x, field), (3,))
-
-
-def _horizontal_position(field: str, x: Any) -> Float[np.ndarray, "2"]:
-    check_range(field, x)
-    value = as_numpy(x, field)
-    if value.shape != (2,):
-        raise ValueError(f"{field} has shape {value.shape}; admissible is (2,): x and y")
-    return value
-
-
 def _line(start: Any, end: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
     """Return the start, the unit vectors forward and to the right, and the length of a line."""
-    first, last = _horizontal_position("start", start), _horizontal_position("end", end)
+    first, last = checked_array("start", start, (2,)), checked_array("end", end, (2,))
     length = float(np.hypot(*(last - first)))
     if not length > 0:
         raise ValueError(f"end = {last.tolist()} is start; admissible is a line with a length")

@@ -18,14 +18,13 @@ Source: Baeumker and Heimes (2001), Proc. OEEPE Workshop Integrated Sensor Orien
 and 3; Skaloud and Lichti (2006), ISPRS J. Photogramm. Remote Sens. 61, 47, equation 1.
 """
 
-from collections.abc import Sequence
 from typing import Any, final
 
 import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
-from jaxlidar._fields.checks import Numbers, UnitWarning, as_numpy, check_range, warn_user
+from jaxlidar._fields.checks import Numbers, UnitWarning, as_numpy, check_range, checked_array, warn_user
 from jaxlidar._fields.crs import crs_name
 from jaxlidar._text import number_text
 
@@ -84,27 +83,21 @@ class Trajectory(eqx.Module):
         crs: str | int | None = None,
     ):
         self.crs = crs_name(crs)
-        check_range("time", time)
-        times = np.atleast_1d(as_numpy(time, "time"))
-        if times.ndim != 1 or times.size == 0:
-            raise ValueError(f"time has shape {times.shape}; admissible is (n,), one number or more")
+        times = checked_array("time", time, (None,) if np.ndim(time) else (1,), one_for_all=True)
+        n = times.size
         falls = np.flatnonzero(np.diff(times) <= 0)
         if falls.size:
             i = int(falls[0])
             raise ValueError(
                 f"time = {times[i + 1]:.9g} follows {times[i]:.9g}; admissible are times that rise strictly"
             )
-        check_range("position", position)
-        positions = as_numpy(position, "position")
-        if positions.shape != (times.size, 3):
-            raise ValueError(
-                f"position has shape {positions.shape}; admissible is ({times.size}, 3), as time"
-            )
-        self.time, self.position = times, positions
-        self.roll = _angle("roll", roll, times.size)
-        self.pitch = _angle("pitch", pitch, times.size, 90.0)
-        self.yaw = _course(positions) if yaw is None else _angle("yaw", yaw, times.size)
-        if yaw is not None:
+        self.time, self.position = times, checked_array("position", position, (n, 3))
+        self.roll = checked_array("roll", roll, (n,), -360.0, 360.0, one_for_all=True)
+        self.pitch = checked_array("pitch", pitch, (n,), -90.0, 90.0, one_for_all=True)
+        if yaw is None:
+            self.yaw = _course(self.position)
+        else:
+            self.yaw = checked_array("yaw", yaw, (n,), -360.0, 360.0, one_for_all=True)
             self._warn_radians()
 
     def __len__(self) -> int:
@@ -172,23 +165,6 @@ def rotation_matrix(roll: Any, pitch: Any, yaw: Any) -> Float[np.ndarray, "*angl
         (-sp, cp * sr, cp * cr),
     )
     return np.stack([np.stack(np.broadcast_arrays(*row), axis=-1) for row in rows], axis=-2)
-
-
-def three_numbers(field: str, x: Sequence[float] | Any) -> Float[np.ndarray, "3"]:
-    """Return three finite numbers; refuse anything else."""
-    check_range(field, x)
-    value = as_numpy(x, field)
-    if value.shape != (3,):
-        raise ValueError(f"{field} has shape {value.shape}; admissible is (3,)")
-    return value
-
-
-def _angle(field: str, x: Any, size: int, largest: float = 360.0) -> Float[np.ndarray, " n"]:
-    check_range(field, x, -largest, largest)
-    value = as_numpy(x, field)
-    if value.shape not in ((), (size,)):
-        raise ValueError(f"{field} has shape {value.shape}; admissible is one number or ({size},), as time")
-    return np.broadcast_to(value, (size,)).copy()
 
 
 def _course(position: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
