@@ -5,8 +5,10 @@ from typing import Any
 
 import click
 
-from jaxlidar.cli.cache import compilation_cache
-from jaxlidar.cli.constants import COMMANDS, version
+from jaxlidar._fields.checks import warn_user
+from jaxlidar._fingerprint import version_of
+from jaxlidar._jax.compilation_cache import compilation_cache
+from jaxlidar.cli.constants import COMMANDS
 from jaxlidar.cli.files import convert, info
 from jaxlidar.cli.optics import prospect, spectra
 from jaxlidar.cli.reference import reference
@@ -58,10 +60,14 @@ def _load_command(point: metadata.EntryPoint) -> click.Command:
     context_settings={"help_option_names": ["-h", "--help"], "show_default": True},
     epilog="Exit statuses: 0 success, 1 failure, 2 wrong usage, 130 interrupted.",
 )
-@click.version_option(version(), message="jaxlidar %(version)s")
+@click.version_option(version_of("jaxlidar"), message="jaxlidar %(version)s")
 @click.option("--cache/--no-cache", default=True, help="Store compiled programs for the next call.")
 @click.pass_context
 def jaxlidar(context: click.Context, cache: bool) -> Any:
     """A differentiable simulator of full-waveform lidar."""
     if cache:
-        context.with_resource(compilation_cache())
+        try:
+            # Until the command ends: Python code that calls it may need its own configuration of JAX.
+            context.with_resource(compilation_cache())
+        except OSError as error:
+            warn_user(f"compiled programs are not kept: {error}")

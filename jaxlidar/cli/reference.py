@@ -10,7 +10,8 @@ from pathlib import Path
 
 import click
 
-from jaxlidar.cli.constants import COMMANDS, version
+from jaxlidar._fingerprint import version_of
+from jaxlidar.cli.constants import COMMANDS
 from jaxlidar.io import atomic_write
 
 LINK = re.compile(r"(!?)\[([^]]*)\]\(([^)#\s]*)(#[^)]*)?\)")
@@ -50,7 +51,9 @@ def reference(out: Path) -> None:
     pictures: dict[str, Path] = {}
     for path, module_name in pages.items():
         modules[module_name] = doc.Module(_page_module(path, pages, pictures))
-    render.configure(docformat="markdown", footer_text=f"jaxlidar {version()}", show_source=False)
+    render.configure(
+        docformat="markdown", footer_text=f"jaxlidar {version_of('jaxlidar')}", show_source=False
+    )
     for name, module in modules.items():
         _write(out / f"{name.replace('.', '/')}.html", render.html_module(module, modules).encode())
     _write(out / "index.html", render.html_index(modules).encode())
