@@ -93,6 +93,20 @@ def max_unpacked_size(path: Path) -> int:
     return max(_MAX_EXPANSION * path.stat().st_size, _ALWAYS_ADMISSIBLE_BYTES)
 
 
+def check_step_of_light(location: str, length: float, expected: float = TWO_WAY_METRES_PER_NS) -> None:
+    """Refuse a length in m of 1 ns of a record that is not what light goes there and back.
+
+    **Arguments:** `expected`: what light goes, m; less in elevation than along an inclined beam.
+
+    **Raises:** ValueError naming the location and both lengths.
+    """
+    if not abs(length - expected) <= TWO_WAY_TOLERANCE * expected:
+        raise ValueError(
+            f"{location}: {length:g} m from sample to sample, where light goes {expected:.4f} m there and "
+            "back in 1 ns"
+        )
+
+
 def column_index(location: str, names: Sequence[str], column: str) -> int:
     """Return the index of a column.
 

@@ -57,10 +57,10 @@ def read_places(path: str | os.PathLike[str], crs: str) -> Places:
 
     - `path`: a file whose name ends in ".h5", or a text file of comma-, semicolon- or tab-separated values,
       whose first line names its columns: x and y (easting and northing) in m in `crs`, or longitude and
-      latitude (lon, lat) in degrees on WGS-84; and where they are known shot_number (shot; id where neither
-      is), unique whole numbers up to 2^63 - 1, and beam, such as "BEAM0101", in any order and case, with
-      spaces or underscores. Other columns are not read; a `UserWarning` names those that nearly have the name
-      of one that is missing.
+      latitude (lon, lat) in degrees on WGS-84, or in the unit that a name ends with; and where they are known
+      shot_number (shot; id where neither is), unique whole numbers up to 2^63 - 1, and beam, such as
+      "BEAM0101", in any order and case, with spaces or underscores. Other columns are not read; a
+      `UserWarning` names those that nearly have the name of one that is missing.
     - `crs`: coordinate reference system of x and y, in metres; or `GEOGRAPHIC`, in which longitudes and
       latitudes stay as they are.
 

@@ -38,8 +38,8 @@ from jaxlidar.formats.checks import (
     MAX_COUNTS,
     MAX_EXACT_INTEGER,
     TWO_WAY_METRES_PER_NS,
-    TWO_WAY_TOLERANCE,
     FileWarning,
+    check_step_of_light,
     refuse_damage,
 )
 from jaxlidar.formats.coordinates import check_elevations
@@ -85,8 +85,8 @@ _UNITS = {
     "delta_time": "s since 2018-01-01",
 }
 # Datasets of other numbers of a GediShot, and of its flags; subsets may have left them out.
-_OPTIONAL = {"solar_elevation": "geolocation/solar_elevation", "delta_time": "delta_time"}
 _FLAGS = {"degrade": "geolocation/degrade", "stale_return": "stale_return_flag"}
+_OPTIONAL = {"solar_elevation": "geolocation/solar_elevation", "delta_time": "delta_time", **_FLAGS}
 # Nothing that GEDI sees lies so far below the ellipsoid, m; fill values do.
 _MIN_ELEVATION = -1000.0
 # Equal samples in a row that noise does not make.
@@ -360,12 +360,7 @@ def _shot(beam: "_Beam", i: int, received: np.ndarray, transmitted: np.ndarray) 
     if bottom >= top:
         raise ValueError(f"{location}: {bottom:g} m is not below the first bin, {top:g} m")
     step = (top - bottom) / (received.size - 1)
-    expected = TWO_WAY_METRES_PER_NS * np.sin(above_horizon)
-    if abs(step - expected) > TWO_WAY_TOLERANCE * expected:
-        raise ValueError(
-            f"{location}: {step:g} m from bin to bin, where 1 ns along the beam is {expected:.4f} m of "
-            "elevation"
-        )
+    check_step_of_light(location, step, TWO_WAY_METRES_PER_NS * np.sin(above_horizon))
     pulse_zero = beam.number("tx_gloc", i, 0.0, transmitted.size - 1)
     pedestal = float(np.median(transmitted[: max(transmitted.size // 4, 1)]))
     return GediShot(
@@ -431,8 +426,8 @@ class _Beam:
 
     def flag(self, name: str, shot: int) -> int | None:
         """Return a flag of a shot, or None where the file does not have it."""
-        values = self._flags.get(name)
-        return None if values is None or np.isnan(values[shot]) else int(values[shot])
+        number = self.optional_number(name, shot)
+        return None if number is None else int(number)
 
     def samples(
         self, kind: str, shots: Sequence[int], errors: dict[int, ValueError]
@@ -521,44 +516,30 @@ class _Beam:
         return {field: self._numbers(field) for field in _PER_SHOT}
 
     @functools.cached_property
-    def _flags(self) -> dict[str, np.ndarray]:
-        """Flags of shots by name, of those that the file has; NaN where they are no whole numbers."""
-        flags = {}
-        for name, field in _FLAGS.items():
-            if not self._has(field):
-                continue
-            try:
-                values = self._numbers(field)
-            except ValueError as error:
-                self.remarks.append(f"{error}: the flag is left out")
-                continue
-            wrong = ~((values == np.floor(values)) & (np.abs(values) <= MAX_EXACT_INTEGER))
-            if wrong.any():
-                first = int(np.argmax(wrong))
-                self.remarks.append(
-                    f"{self.location(field, first)}: {values[first]:g} is no whole number: {np.sum(wrong)} "
-                    f"of {self.size} flags of {self.name} left out"
-                )
-            flags[name] = np.where(wrong, np.nan, values)
-        return flags
-
-    @functools.cached_property
     def _optional(self) -> dict[str, np.ndarray]:
-        """Numbers of shots by name, of those of `_OPTIONAL` that the file has; NaN where they are missing."""
+        """Numbers of shots by name, of those of `_OPTIONAL` that the file has; NaN where they are missing.
+
+        Flags that are no whole numbers are missing, too.
+        """
         columns = {}
         for name, field in _OPTIONAL.items():
             if not self._has(field):
                 continue
             try:
-                columns[name] = self._numbers(field)
+                values = self._numbers(field)
             except ValueError as error:
                 self.remarks.append(f"{error}: it is left out")
+                continue
+            wrong = ~((values == np.floor(values)) & (np.abs(values) <= MAX_EXACT_INTEGER))
+            if name in _FLAGS and wrong.any():
+                first = int(np.argmax(wrong))
+                self.remarks.append(
+                    f"{self.location(field, first)}: {values[first]:g} is no whole number: {np.sum(wrong)} "
+                    f"of {self.size} flags of {self.name} left out"
+                )
+                values = np.where(wrong, np.nan, values)
+            columns[name] = values
         return columns
-
-    def _start_indices(self, kind: str) -> np.ndarray:
-        """Return the start indices of all shots, from 1; NaN where they are missing."""
-        field = f"{kind}_sample_start_index"
-        return self._numbers(field) if self._has(field) else np.full(self.size, np.nan)
 
     @functools.cached_property
     def _sample_locations(self) -> "dict[str, _SampleLocation]":
@@ -572,10 +553,10 @@ class _Beam:
         """
         size = self._dataset(f"{kind}waveform").size
         count = _whole_numbers(self._per_shot[f"{kind}_sample_count"], 0, size)
-        indices = self._start_indices(kind)
+        field = f"{kind}_sample_start_index"
+        indices = self._numbers(field) if self._has(field) else np.full(self.size, np.nan)
         # The product counts from 1.
         recorded_start = np.maximum(_whole_numbers(indices, 1, 2**62) - 1, -1)
-        field = f"{kind}_sample_start_index"
         # Shots without samples need no start.
         (shots,) = np.nonzero(count != 0)
         start = np.full(self.size, -1)

@@ -24,6 +24,7 @@ from jaxlidar.formats.checks import (
     TWO_WAY_METRES_PER_NS,
     TWO_WAY_TOLERANCE,
     FileWarning,
+    check_step_of_light,
     refuse_damage,
 )
 from jaxlidar.formats.coordinates import GEOGRAPHIC_3D, CoordinateUnits, check_elevations
@@ -213,11 +214,7 @@ class _LvisShots(AirborneShots):
             raise ValueError(f"{location}: its position is {anchor.tolist()}")
         check_elevations(location, anchor[2])
         length = float(np.linalg.norm(direction * _UNITS.metres(anchor)))
-        if abs(length - TWO_WAY_METRES_PER_NS) > TWO_WAY_TOLERANCE * TWO_WAY_METRES_PER_NS:
-            raise ValueError(
-                f"{location}: {length:g} m per ns from the first to the last sample, where light goes "
-                f"{TWO_WAY_METRES_PER_NS:.4f} m there and back"
-            )
+        check_step_of_light(location, length)
         if direction[2] >= 0:
             raise ValueError(f"{location}: its last sample is not below the first one")
         received, sent = self._waves(index)

@@ -30,8 +30,7 @@ from jaxlidar.formats.checks import (
     MAX_COORDINATE,
     MAX_COUNTS,
     MAX_EXACT_INTEGER,
-    TWO_WAY_METRES_PER_NS,
-    TWO_WAY_TOLERANCE,
+    check_step_of_light,
     column_index,
 )
 from jaxlidar.formats.coordinates import check_elevations
@@ -163,11 +162,7 @@ def _shot(
     location = f"{path}: geo: {shot}"
     step = np.array([geo["dx"], geo["dy"], geo["dz"]])
     length = float(np.linalg.norm(step))
-    if abs(length - TWO_WAY_METRES_PER_NS) > TWO_WAY_TOLERANCE * TWO_WAY_METRES_PER_NS:
-        raise ValueError(
-            f"{location}: dx, dy, dz: {length:g} m from sample to sample, where 1 ns is "
-            f"{TWO_WAY_METRES_PER_NS:.4f} m"
-        )
+    check_step_of_light(f"{location}: dx, dy, dz", length)
     if step[2] >= 0:
         raise ValueError(f"{location}: dz = {step[2]:g} m does not lead down")
     anchor = np.array([geo["V9"], geo["V10"], geo["V11"]]) - geo["V16"] * step
