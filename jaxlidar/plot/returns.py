@@ -4,16 +4,14 @@ Returns are coloured by their class, their material or their height. Each group 
 the most frequent first, so that rare ones lie on top.
 """
 
-import itertools
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 from matplotlib.axes import Axes
-from matplotlib.ticker import MaxNLocator
-from mpl_toolkits.mplot3d import Axes3D, proj3d
+from mpl_toolkits.mplot3d import Axes3D
 
-from jaxlidar._fields.checks import check_choice, check_kind, check_number, check_range, check_shape
+from jaxlidar._fields.checks import check_choice, check_kind, check_number, checked_array
 from jaxlidar.plants.point_cloud import PointCloud
 from jaxlidar.plot.style import (
     MATERIAL_COLOURS,
@@ -22,6 +20,7 @@ from jaxlidar.plot.style import (
     label_map,
     make_axes,
     material_colours,
+    oblique_axes,
 )
 from jaxlidar.scenes.scene import Scene
 from jaxlidar.scenes.terrain import Terrain
@@ -99,7 +98,7 @@ def points(
     check_number("azimuth", azimuth)
     position = np.asarray(returns.position, float)
     if view == "oblique":
-        axes = _oblique_axes(ax, position, elevation, azimuth)
+        axes = oblique_axes(ax, position.min(axis=0), position.max(axis=0), elevation, azimuth, (6.4, 4.6))
         _draw_coloured(axes, position, returns, colour_by, size, legend)
         return axes
     ax = make_axes(ax, (5.2, 4.6))
@@ -156,10 +155,7 @@ def section(
     check_number("size", size, 0.0, low_open=True)
     check_number("width", width, 0.0, low_open=True)
     check_kind("scene", scene, Scene | None, "a Scene or None")
-    for name, value in (("start", start), ("end", end)):
-        check_range(name, value)
-        check_shape(name, value, (2,))
-    first, last = np.asarray(start, float), np.asarray(end, float)
+    first, last = checked_array("start", start, (2,)), checked_array("end", end, (2,))
     length = float(np.linalg.norm(last - first))
     if length == 0:
         raise ValueError(f"start and end are both {first.tolist()}; admissible is a line with a length")
@@ -290,40 +286,3 @@ def _ground_heights(scene: Scene, points: Float[np.ndarray, "n 2"]) -> Float[np.
         # Beams straight down from above all ground, which meet it anywhere.
         heights[inside] = ground_position(Survey(Lidar(), points[inside], zenith=0.0), scene)[:, 2]
     return heights
-
-
-def _oblique_axes(
-    ax: Axes | Axes3D | None, position: Float[np.ndarray, "n 3"], elevation: float, azimuth: float
-) -> Axes3D:
-    """Return three-dimensional axes with equal scales around points, seen from a direction."""
-    if ax is None:
-        from matplotlib import pyplot
-
-        ax = pyplot.figure(figsize=(6.4, 4.6), layout="constrained").add_subplot(projection="3d")
-    check_kind("ax", ax, Axes3D, 'three-dimensional axes, as of add_subplot(projection="3d")')
-    assert isinstance(ax, Axes3D)
-    low, high = position.min(axis=0), position.max(axis=0)
-    # Flat clouds need a box with a height.
-    sides = np.maximum(high - low, 1e-3 * max(float(np.max(high - low)), 1.0))
-    middle = 0.5 * (low + high)
-    for name, centre, side in zip(("xlim", "ylim", "zlim"), middle, sides):
-        ax.set(**{name: (centre - 0.5 * side, centre + 0.5 * side)})
-    # matplotlib's azimuth is counted from the x axis, counterclockwise.
-    ax.view_init(elev=elevation, azim=90.0 - azimuth)
-    # A box of any shape fills the axes but for the room of its labels.
-    ax.set_box_aspect(sides.tolist(), zoom=1)
-    corners = np.array(list(itertools.product(*zip(middle - 0.5 * sides, middle + 0.5 * sides))))
-    x, y, z = corners.T
-    horizontal, vertical, _ = proj3d.proj_transform(x, y, z, ax.get_proj())
-    # In parts of the axes' half width, from their centre: nearer corners lie farther out.
-    extent = np.max(np.abs(np.stack([horizontal, vertical]))) / ax.viewLim.xmax
-    zoom: Any = 0.72 / extent
-    ax.set_box_aspect(sides.tolist(), zoom=zoom)
-    ax.set(xlabel="x, east (m)", ylabel="y, north (m)", zlabel="height (m)")
-    ax.tick_params(labelsize="x-small")
-    for axis, side, largest in zip((ax.xaxis, ax.yaxis, ax.zaxis), sides, high):
-        axis.set_major_locator(MaxNLocator(nbins=max(round(4 * side / max(sides)), 1)))
-        # Labels of axes lie beyond those of ticks, of which map coordinates have six or seven digits.
-        axis.labelpad = 1.5 * len(f"{largest:.0f}")
-    ax.ticklabel_format(style="plain", useOffset=False)
-    return ax

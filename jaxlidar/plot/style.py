@@ -13,6 +13,7 @@ from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize, to_hex
 from matplotlib.ticker import MaxNLocator
+from mpl_toolkits.mplot3d import Axes3D, proj3d
 
 from jaxlidar._fields.checks import check_kind, check_number
 from jaxlidar.planning.channels import unnumbered
@@ -169,3 +170,48 @@ def make_axes(ax: Axes | None, size: tuple[float, float]) -> Axes:
     from matplotlib import pyplot
 
     return pyplot.subplots(figsize=size, layout="constrained")[1]
+
+
+def oblique_axes(
+    ax: Axes | Axes3D | None,
+    low: Float[np.ndarray, "3"],
+    high: Float[np.ndarray, "3"],
+    elevation: float,
+    azimuth: float,
+    size: tuple[float, float],
+) -> Axes3D:
+    """Return three-dimensional axes with equal scales around a box, seen from a direction.
+
+    **Arguments:** `low`, `high`: corners of the box, m. `elevation`, `azimuth`: of the viewer, degrees above
+    the horizon and clockwise from north. `size`: of a new figure, inches, if `ax` is None.
+    """
+    if ax is None:
+        from matplotlib import pyplot
+
+        ax = pyplot.figure(figsize=size, layout="constrained").add_subplot(projection="3d")
+    check_kind("ax", ax, Axes3D, 'three-dimensional axes, as of add_subplot(projection="3d")')
+    assert isinstance(ax, Axes3D)
+    # Flat boxes need a height.
+    sides = np.maximum(high - low, 1e-3 * max(float(np.max(high - low)), 1.0))
+    middle = 0.5 * (low + high)
+    for name, centre, side in zip(("xlim", "ylim", "zlim"), middle, sides):
+        ax.set(**{name: (centre - 0.5 * side, centre + 0.5 * side)})
+    # matplotlib's azimuth is counted from the x axis, counterclockwise.
+    ax.view_init(elev=elevation, azim=90.0 - azimuth)
+    # A box of any shape fills the axes but for the room of its labels.
+    ax.set_box_aspect(sides.tolist(), zoom=1)
+    corners = np.array(list(itertools.product(*zip(middle - 0.5 * sides, middle + 0.5 * sides))))
+    x, y, z = corners.T
+    horizontal, vertical, _ = proj3d.proj_transform(x, y, z, ax.get_proj())
+    # In parts of the axes' half width, from their centre: nearer corners lie farther out.
+    extent = np.max(np.abs(np.stack([horizontal, vertical]))) / ax.viewLim.xmax
+    zoom: Any = 0.72 / extent
+    ax.set_box_aspect(sides.tolist(), zoom=zoom)
+    ax.set(xlabel="x, east (m)", ylabel="y, north (m)", zlabel="height (m)")
+    ax.tick_params(labelsize="x-small")
+    for axis, side, largest in zip((ax.xaxis, ax.yaxis, ax.zaxis), sides, high):
+        axis.set_major_locator(MaxNLocator(nbins=max(round(4 * side / max(sides)), 1)))
+        # Labels of axes lie beyond those of ticks, of which map coordinates have six or seven digits.
+        axis.labelpad = 1.5 * len(f"{largest:.0f}")
+    ax.ticklabel_format(style="plain", useOffset=False)
+    return ax

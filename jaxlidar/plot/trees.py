@@ -14,7 +14,7 @@ from mpl_toolkits.mplot3d.art3d import Line3DCollection
 
 from jaxlidar._fields.checks import check_number
 from jaxlidar.plants.tree import Tree
-from jaxlidar.plot.style import MATERIAL_COLOURS
+from jaxlidar.plot.style import MATERIAL_COLOURS, oblique_axes
 
 # Width of the thinnest lines, in points: thinner ones would be too faint.
 MIN_LINEWIDTH = 0.25
@@ -65,8 +65,11 @@ def tree(
     joined = _joined(tree)
     if not len(joined.start):
         raise ValueError("tree has 0 segments; at least 1 is admissible")
-    ax = _make_axes(ax)
-    scale = _frame(ax, joined, elevation, azimuth)
+    points = np.concatenate([joined.start, joined.end, joined.bud_position, joined.base[None]])
+    low, high = points.min(axis=0), points.max(axis=0)
+    margin = 0.02 * np.max(high - low)
+    ax = oblique_axes(ax, low - [margin, margin, 0.0], high + margin, elevation, azimuth, (5.0, 5.0))
+    scale = _points_per_metre(ax)
     width = scale * (joined.radius_start + joined.radius_end)
     lines = Line3DCollection(
         np.stack([joined.start, joined.end], axis=1).tolist(),
@@ -139,28 +142,6 @@ def _joined(tree: Tree | Iterable[Tree]) -> Tree:
     return tree if isinstance(tree, Tree) else Tree.joined(tree)
 
 
-def _frame(ax: Axes3D, joined: Tree, elevation: float, azimuth: float) -> float:
-    """Set equal scales and limits around wood and leaves, and label the axes; return the points per metre."""
-    points = np.concatenate([joined.start, joined.end, joined.bud_position])
-    low, high = points.min(axis=0), points.max(axis=0)
-    low[2] = min(low[2], joined.base[2])
-    margin = 0.02 * np.max(high - low)
-    # East and north have limits of the same width, so that narrow trees are not stretched.
-    middle, half = 0.5 * (low + high), 0.5 * np.max((high - low)[:2]) + margin
-    ax.set(xlim=(middle[0] - half, middle[0] + half), ylim=(middle[1] - half, middle[1] + half))
-    ax.set(zlim=(low[2], high[2] + margin))
-    # matplotlib's azimuth is counted from the x axis, counterclockwise.
-    ax.view_init(elev=elevation, azim=90.0 - azimuth)
-    sides = np.array([2 * half, 2 * half, high[2] + margin - low[2]])
-    # A tall box would extend beyond the edges of the figure.
-    zoom: Any = min(1.0, 0.75 * float(np.linalg.norm(sides) / sides[2]))
-    ax.set_box_aspect(sides.tolist(), zoom=zoom)
-    ax.set(xlabel="x, east (m)", ylabel="y, north (m)", zlabel="height (m)")
-    ax.tick_params(labelsize="x-small")
-    ax.locator_params(nbins=5)
-    return _points_per_metre(ax)
-
-
 def _points_per_metre(ax: Axes3D) -> float:
     """Compute the points per metre at the middle of the axes, from the projection of a vertical metre."""
     x, y, z = (np.mean(limits) for limits in (ax.get_xlim(), ax.get_ylim(), ax.get_zlim()))
@@ -171,14 +152,3 @@ def _points_per_metre(ax: Axes3D) -> float:
     figure = ax.get_figure()
     assert isinstance(figure, Figure)
     return float(np.hypot(*pixels[0])) * 72 / figure.dpi
-
-
-def _make_axes(ax: Axes3D | None) -> Axes3D:
-    """Return `ax`, or the axes of a new figure if it is None."""
-    if ax is not None:
-        return ax
-    from matplotlib import pyplot
-
-    ax = pyplot.figure(figsize=(5.0, 5.0), layout="constrained").add_subplot(projection="3d")
-    assert isinstance(ax, Axes3D)
-    return ax
