@@ -31,13 +31,7 @@ from jaxlidar.formats.airborne import AirborneShot, AirborneShots, Returns, Segm
 from jaxlidar.formats.checks import MAX_COORDINATE, existing_file
 from jaxlidar.formats.coordinates import check_elevations, find_units, wkt_of_units
 from jaxlidar.formats.files import atomic_writes
-from jaxlidar.formats.las import (
-    import_laspy,
-    las_path,
-    las_points,
-    point_format_of,
-    scan_angles,
-)
+from jaxlidar.formats.las import import_laspy, las_path, las_points, point_format_of, scan_angles
 from jaxlidar.formats.las_header import LasHeader, read_header
 from jaxlidar.formats.laz import decompress_points
 

@@ -8,7 +8,6 @@ from jaxlidar.plants.voxelise import voxelise
 from jaxlidar.scenes.canopy import Canopy
 from jaxlidar.scenes.scene import Scene
 from jaxlidar.scenes.surfaces import Ground
-from jaxlidar.scenes.voxels import VoxelMap
 from jaxlidar.sensors.lidar import Lidar
 from jaxlidar.sensors.pulse import GaussianPulse
 
@@ -63,17 +62,12 @@ def demo_scene(voxel_size: float = 0.25, *, seed: int = 0) -> Scene:
     **Raises:** ValueError for a voxel size outside (0, 1].
     """
     check_number("voxel_size", voxel_size, 0.0, 1.0, low_open=True)
+    tree = grow(seed=seed)
     return Scene(
         canopy=Canopy(
-            demo_tree(voxel_size, seed=seed),
+            voxelise(tree, voxel_size, leaf_area=LEAF_AREA / len(tree.bud_position), wood="surface"),
             leaf=Prospect(N=1.6, Cab=45.0, Car=10.0, Cw=0.012, Cm=0.008),
             bark=spectrum("bark-oak"),
         ),
         ground=Ground(height=0.0, reflectance=spectrum("soil-medium")),
     )
-
-
-def demo_tree(voxel_size: float, *, seed: int) -> VoxelMap:
-    """The voxel map of the default tree with 250 m2 of leaves; `voxel_size` is the voxel edge in m."""
-    tree = grow(seed=seed)
-    return voxelise(tree, voxel_size, leaf_area=LEAF_AREA / len(tree.bud_position), wood="surface")

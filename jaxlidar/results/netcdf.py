@@ -27,13 +27,7 @@ from jaxlidar.results.datasets import (
     keep_as_netcdf,
     result_of,
 )
-from jaxlidar.results.groups import (
-    StoredGroups,
-    is_result_file,
-    open_groups,
-    write_groups,
-    write_zarr_group,
-)
+from jaxlidar.results.groups import StoredGroups, is_result_file, open_groups, write_groups, write_zarr_group
 from jaxlidar.results.store import RESULT, ResultStore, consolidate, plain_errors, replacing
 from jaxlidar.sensors.photon_counter import PhotonEvents
 from jaxlidar.simulation.truth import Truth

@@ -39,13 +39,7 @@ from jaxlidar._vectors import FAR, Scalar, Vec, along, dot, vec
 from jaxlidar.optics.laws import AbstractLaw, AbstractMirror, Lambertian
 from jaxlidar.optics.spectra import Spectrum
 from jaxlidar.scenes.shapes import AbstractShape
-from jaxlidar.scenes.surfaces import (
-    AbstractSheet,
-    Reflectance,
-    as_reflectance,
-    check_reflectance,
-    check_sum,
-)
+from jaxlidar.scenes.surfaces import AbstractSheet, Reflectance, as_reflectance, check_reflectance, check_sum
 from jaxlidar.scenes.triangle_tree import (
     ROW,
     TriangleTree,

@@ -39,13 +39,7 @@ from jaxlidar.optics.spectra import Spectrum
 from jaxlidar.scenes.height_field import HeightField
 from jaxlidar.scenes.raster import Raster
 from jaxlidar.scenes.shapes import AbstractShape, Plane
-from jaxlidar.scenes.surfaces import (
-    AbstractGround,
-    Ground,
-    Reflectance,
-    as_reflectance,
-    check_reflectance,
-)
+from jaxlidar.scenes.surfaces import AbstractGround, Ground, Reflectance, as_reflectance, check_reflectance
 
 # Heights are taken as a plane if they deviate from it by less than this fraction of the spacing, plus this
 # fraction of the largest height for rounding.

@@ -42,11 +42,7 @@ from jaxlidar._fields.checks import (
 from jaxlidar._fields.ranges import NANOMETRES, NOT_NEGATIVE, POSITIVE, check_ranges, quantity
 from jaxlidar._jax.products import einsum
 from jaxlidar._not_kept import NotKept, check_kept
-from jaxlidar.sensors.photon_counter import (
-    MAX_NEGATIVE_FRACTION,
-    PhotonCounter,
-    check_negative_energy,
-)
+from jaxlidar.sensors.photon_counter import MAX_NEGATIVE_FRACTION, PhotonCounter, check_negative_energy
 
 # Above this expectation a Poisson count is drawn as a normal variable of its first three moments. The exact
 # sampler of JAX weighs terms of the size m ln m in single precision, whatever the precision of the draws:
