@@ -293,11 +293,10 @@ def checked_array(
     check_range(field, x, low, high, **limits)
     array = as_numpy(x, field)
     if one_for_all and array.ndim == 0:
-        return np.full(shape, array)
-    if array.ndim == len(shape):
-        shape = tuple(max(m, 1) if n is None else n for m, n in zip(array.shape, shape))
-    if array.shape != shape:
-        rows = str(shape).replace("None", "n")
+        return np.full([1 if n is None else n for n in shape], array)
+    fits = [m > 0 if n is None else m == n for m, n in zip(array.shape, shape)]
+    if array.ndim != len(shape) or not all(fits):
+        rows = str(shape).replace("None", "n") + (", n at least 1" if None in shape else "")
         admissible = f"one number or {rows}" if one_for_all else rows
         raise ValueError(f"{field} has shape {array.shape}; admissible is {admissible}")
     return array.copy()

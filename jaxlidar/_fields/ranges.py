@@ -124,7 +124,8 @@ def check_ranges(module: Any) -> None:
     """
     for name, admissible in _ranges(module).items():
         if (value := _value(module, name)) is not None:
-            check_range(name, value, *admissible[:2], **_openness(admissible))
+            low, high, low_open, high_open, *_ = admissible
+            check_range(name, value, low, high, low_open=low_open, high_open=high_open)
     for name, unit in _stated(module, "unit").items():
         if isinstance(unit, Magnitude):
             warn_unit(name, getattr(module, name), unit)
@@ -187,10 +188,6 @@ def _is_outside(x: Array, admissible: Range) -> Bool[Array, ""]:
     if high < np.inf:
         inside &= x < high if high_open else x <= high + slack * max(abs(high), 1.0)
     return ~(in_order & jnp.all(inside))
-
-
-def _openness(admissible: Range) -> dict[str, bool]:
-    return {"low_open": admissible.low_open, "high_open": admissible.high_open}
 
 
 def _value(module: Any, name: str) -> Any:

@@ -100,12 +100,18 @@ def read_qsm(path: str | os.PathLike[str], *, scale: float | None = None) -> Tre
         if row.id in rows:
             raise ValueError(f"{path}: line {number}: ID {row.id} was given in line {rows[row.id].line}")
         rows[row.id] = row
-    parent_of = {row.id: _parent_in_file(row, rows) for row in rows.values()}
+    # Of a root, and of a cylinder whose parent is missing, it is `_NO_PARENT`.
+    parent_of = {
+        row.id: row.parent if row.parent in rows and row.parent != row.id else _NO_PARENT
+        for row in rows.values()
+    }
     roots = [row for row in rows.values() if parent_of[row.id] == _NO_PARENT]
     # The other roots are cylinders whose parents were cut off.
     is_declared = [row.parent <= 0 or row.parent == row.id for row in roots]
     trunk_orders = [row.order for row, declared in zip(roots, is_declared) if declared]
     cut = [row for row, declared in zip(roots, is_declared) if not declared]
+    # Orders are counted from 1 where no order is smaller.
+    first_order = int(min(trunk_orders, default=0) == 1 and all(row.order >= 1 for row in rows.values()))
     cylinders, parents, dropped = [], [], {"without a length": 0}
     # Index of each cylinder in the tree, by ID. One without a length has the index of its parent.
     index = {_NO_PARENT: -1}
@@ -126,7 +132,7 @@ def read_qsm(path: str | os.PathLike[str], *, scale: float | None = None) -> Tre
         radius_start=radius,
         radius_end=radius.copy(),
         parent=np.array(parents),
-        order=np.array([row.order for row in cylinders]) - _first_order(rows, trunk_orders),
+        order=np.array([row.order for row in cylinders]) - first_order,
         bud_position=np.zeros((0, 3)),
         bud_direction=np.zeros((0, 3)),
         bud_radius=np.zeros(0),
@@ -194,17 +200,6 @@ def _cylinder(
         end=end,
         radius=lengths["radius"],
     )
-
-
-def _parent_in_file(row: _Cylinder, rows: dict[int, _Cylinder]) -> int:
-    """Return the ID of a cylinder's parent, or `_NO_PARENT` where it is a root or its parent is missing."""
-    return row.parent if row.parent in rows and row.parent != row.id else _NO_PARENT
-
-
-def _first_order(rows: dict[int, _Cylinder], trunk_orders: list[int]) -> int:
-    """Return the branching order of the trunk in the file: 1 where no order is smaller, else 0."""
-    is_from_one = min(trunk_orders, default=0) == 1 and all(row.order >= 1 for row in rows.values())
-    return int(is_from_one)
 
 
 def _parents_first(path: Path, rows: dict[int, _Cylinder], parent_of: dict[int, int]) -> list[_Cylinder]:

@@ -14,6 +14,7 @@ from jaxlidar._fields.checks import (
     check_range,
     check_seed,
     check_shape,
+    checked_array,
     kind_of,
 )
 from jaxlidar.plants.habits import Habit, grow
@@ -176,10 +177,7 @@ def _quantiles(heights: Any, probability: Float[np.ndarray, " n"]) -> Float[np.n
             f"heights is {kind_of(heights)}; admissible are a number, a sample of numbers, or a distribution "
             "with a method ppf, such as scipy.stats.norm(20.0, 2.0)"
         )
-    check_range("heights", heights, 0.0, MAX_TREE_HEIGHT, low_open=True)
-    sample = np.atleast_1d(np.asarray(heights, float))
-    if sample.ndim != 1 or not sample.size:
-        raise ValueError(f"heights has shape {sample.shape}; admissible is one number, or (m,) with m >= 1")
+    sample = checked_array("heights", heights, (None,), 0.0, MAX_TREE_HEIGHT, one_for_all=True, low_open=True)
     return np.quantile(sample, probability, method="inverted_cdf")
 
 

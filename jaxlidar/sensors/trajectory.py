@@ -83,7 +83,7 @@ class Trajectory(eqx.Module):
         crs: str | int | None = None,
     ):
         self.crs = crs_name(crs)
-        times = checked_array("time", time, (None,) if np.ndim(time) else (1,), one_for_all=True)
+        times = checked_array("time", time, (None,), one_for_all=True)
         n = times.size
         falls = np.flatnonzero(np.diff(times) <= 0)
         if falls.size:
