@@ -252,7 +252,7 @@ def _read_rows(
     **Arguments:** `counts_skipped`: have a remark on each beam with shots that are not complete.
     """
     with open_hdf5(path, "GEDI L1B") as file:
-        beams, beam_errors = _open_beams(file, file.groups("BEAM"))
+        beams, beam_errors = file.read_groups("BEAM", lambda name: _Beam(file, name))
         selected = _select(file.path, beams, requested)
         # By beam, so that the samples of neighbouring shots are read together.
         indices_by_beam: dict[_Beam, set[int]] = {}
@@ -288,22 +288,6 @@ def _requested_numbers(shot: Any) -> list[int]:
     # NumPy counts times among the integers.
     check_numbers("shot", shot)
     return [int(number) for number in requested]
-
-
-def _open_beams(file: ProductFile, names: list[str]) -> "tuple[list[_Beam], list[ValueError]]":
-    """Return the beams that have shot numbers, and the errors of the others.
-
-    **Raises:** the first of these errors, where no beam has shot numbers.
-    """
-    beams, errors = [], []
-    for name in names:
-        try:
-            beams.append(_Beam(file, name))
-        except ValueError as error:
-            errors.append(error)
-    if not beams:
-        raise errors[0]
-    return beams, errors
 
 
 def _select(path: Path, beams: "list[_Beam]", requested: list[int] | None) -> "list[tuple[_Beam, int]]":

@@ -175,17 +175,9 @@ def _read(
             raise TypeError(
                 f"shot_number has the type {np.asarray(shot_number).dtype}; admissible are whole numbers"
             )
-    beams: list[dict[str, Column]] = []
-    errors: list[ValueError] = []
     # The products' -9999 is a fill value also where no attribute says so.
     with open_hdf5(path, product, lambda values: values == _FILL) as file:
-        for beam in file.groups("BEAM"):
-            try:
-                beams.append(_read_beam(file, beam, fields, needed))
-            except ValueError as error:
-                errors.append(error)
-    if not beams:
-        raise errors[0]
+        beams, errors = file.read_groups("BEAM", lambda beam: _read_beam(file, beam, fields, needed))
     for error in errors:
         warn_user(f"{error}: the beam is skipped", FileWarning)
     # A column that one beam lacks would leave rows without a value: such columns are NaN there.

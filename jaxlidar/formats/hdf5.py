@@ -22,7 +22,7 @@ import os
 import re
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from jaxtyping import Float
@@ -52,6 +52,8 @@ _HEAP = b"GCOL\x01\0\0\0"
 _OBJECT_SIZE_OFFSET = _HEAP_ALIGNMENT = 8
 # Kinds of the types of attributes that do not lie in heaps: numbers, and text of a fixed length.
 _PLAIN_KINDS = "biufS"
+
+_Group = TypeVar("_Group")
 
 
 @contextlib.contextmanager
@@ -108,6 +110,23 @@ class ProductFile:
         if not names:
             raise ValueError(f"{self.path}: no group {prefix}...: no {self.product} product")
         return names
+
+    def read_groups(
+        self, prefix: str, read: Callable[[str], _Group]
+    ) -> tuple[list[_Group], list[ValueError]]:
+        """Return what `read` makes of the groups that begin with `prefix`, and its errors for the others.
+
+        **Raises:** the first of these errors, where there is none but them; as `groups`.
+        """
+        groups, errors = [], []
+        for name in self.groups(prefix):
+            try:
+                groups.append(read(name))
+            except ValueError as error:
+                errors.append(error)
+        if not groups:
+            raise errors[0]
+        return groups, errors
 
     def has(self, name: str) -> bool:
         """Return True if the file has a dataset or group of that name."""

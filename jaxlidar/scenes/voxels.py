@@ -16,10 +16,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy
-from jaxtyping import Array, ArrayLike, Float, Int
+from jaxtyping import Array, Float, Int
 
 from jaxlidar._fields.checks import (
     Magnitude,
+    Numbers,
     as_array,
     as_optional_array,
     check_kind,
@@ -46,10 +47,6 @@ _FACE_TOLERANCE = 1e-6
 _POINTS, _POINTS_AT_ONCE = 8, 2**21
 # Bytes of a voxel while maps are joined.
 _BYTES_PER_VOXEL = 40.0
-
-
-# Numbers, arrays or nested sequences of numbers.
-Numbers = ArrayLike | Sequence
 
 
 def _as_triple(x: Numbers, field: str = "voxel_size") -> Float[Array, "3"]:

@@ -46,6 +46,8 @@ def test_places_are_read_from_maps_and_from_longitude_and_latitude(tmp_path):
     places = places_of(tmp_path, "id,shot_number,x,y\n1,19640119100108615,2,3\n2,9223372036854775807,2,4\n")
     assert places.shot_number.tolist() == [19640119100108615, 2**63 - 1]
     assert places_of(tmp_path, "x,y,Shot Number\n1,2,7\n").shot_number.tolist() == [7]
+    # Units of names.
+    assert places_of(tmp_path, "x [km],y_ft\n1,1000\n").position.tolist() == [[1000.0, 304.8]]
     with pytest.warns(
         UserWarning, match=r"places.csv: line 1: columns are not read: 'shot_no' \(as shotnumber"
     ):
@@ -61,6 +63,7 @@ def test_places_are_read_from_maps_and_from_longitude_and_latitude(tmp_path):
         ("x,y\n1,2\n3\n", "line 3: 1 values; the header names 2"),
         ("x,y\n1,2\n3,north\n", "line 3: y = 'north' is no number"),
         ("x,y\n1,nan\n", "line 2: y = nan; admissible"),
+        ("x [s],y\n1,2\n", r"line 1: 'x \[s\]': the unit 's' is not known; known are m, metre"),
         ("lon,lat\n15,91\n", "line 2: latitude = 91; admissible is"),
         ("lon,lat\n15,50\n-75,0\n", "line 3: longitude -75 and latitude 0 lie outside"),
         ("x,y,id\n1,2,3.5\n", "line 2: shot_number = '3.5' is no whole number"),
