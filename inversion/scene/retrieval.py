@@ -493,7 +493,8 @@ class _Problem:
         For signs e, (J^T e)_k^2 has the expectation (J^T J)_kk.
         """
         # Exact for the priors; a few random signs do for the data, as the diagonal only scales the unknowns.
-        diagonal = self.priors.diagonal(x) + self.bounds_precision
+        squares = self.priors.jacobian(x).power(2)
+        diagonal = squares.T @ np.ones(squares.shape[0]) + self.bounds_precision
         for _ in range(_SCALE_DRAWS):
             signs = random.choice([-1.0, 1.0], size=self.model.weight.shape)
             diagonal += self.model.pull_back(x, signs * self.model.weight) ** 2 / _SCALE_DRAWS
@@ -501,8 +502,9 @@ class _Problem:
 
     def product(self, x: np.ndarray, v: np.ndarray) -> Float[np.ndarray, " n"]:
         """Return the product of H of the module with a vector."""
-        prior = self.priors.pull_back(x, self.priors.push_forward(x, v)) + self.bounds_precision * v
-        return self.model.gauss_newton_product(x, v) + prior
+        jacobian = self.priors.jacobian(x)
+        of_priors = jacobian.T @ (jacobian @ v) + self.bounds_precision * v
+        return self.model.gauss_newton_product(x, v) + of_priors
 
     def is_free(self, x: Float[np.ndarray, " n"]) -> Bool[np.ndarray, " n"]:
         """Return True for values that are not at one of their bounds, where L-BFGS-B puts them exactly."""
@@ -724,9 +726,10 @@ def _draws_of_error(
         # The right side has the covariance H, so that H^-1 of it has the posterior's covariance H^-1.
         weight = problem.model.weight
         of_data = problem.model.pull_back(end.x, random.normal(size=weight.shape) * weight)
-        of_priors = [random.normal(size=r.shape) for r in problem.priors.residuals(end.x)]
+        jacobian = problem.priors.jacobian(end.x)
+        of_priors = jacobian.T @ random.normal(size=jacobian.shape[0])
         of_bounds = np.sqrt(problem.bounds_precision) * random.normal(size=end.x.size)
-        right_side = of_data + problem.priors.pull_back(end.x, of_priors) + of_bounds
+        right_side = of_data + of_priors + of_bounds
         errors[number] = problem.solve(end, right_side)
         store.write(number, error=errors[number])
         if callable(progress):
