@@ -85,6 +85,15 @@ def outcomes(
         yield unit, outcome.arrays
 
 
+def in_turn(tasks: Sequence[WorkUnit]) -> Iterator[tuple[WorkUnit, Any]]:
+    """Yield tasks and their results, one after the other in this thread. **Raises:** as `outcomes`."""
+    for unit in tasks:
+        outcome = run_unit(unit)
+        if outcome.error is not None:
+            raise outcome.error
+        yield unit, outcome.arrays
+
+
 def _run_locally(
     units: Sequence[WorkUnit], devices: Sequence[Any] | None = None
 ) -> Iterator[tuple[WorkUnit, UnitOutcome]]:

@@ -23,7 +23,7 @@ import shutil
 import time
 import warnings
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from concurrent.futures import Executor
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -36,7 +36,7 @@ from jaxtyping import Bool, Float, Int, PRNGKeyArray
 from jaxlidar._fields.checks import check_key, check_kind, check_number
 from jaxlidar._fields.crs import common_system
 from jaxlidar._fingerprint import digest_of, fingerprint
-from jaxlidar._jax.workers import WorkUnit, outcomes, portable_key, run_unit, task
+from jaxlidar._jax.workers import in_turn, outcomes, portable_key, task
 from jaxlidar.formats.checks import existing_file
 from jaxlidar.formats.las import las_extent, read_las
 from jaxlidar.optics.leaf import LeafOptics
@@ -203,9 +203,9 @@ def simulate_tiles(
     stored = done = shots - sum(len(tiles[unit.number].shots) for unit in missing)
     start_time = time.perf_counter()
     # In this process a tile has all cores, and the next one waits.
-    run = _in_turn(missing) if executor is None else (unit for unit, _ in outcomes(missing, executor))
+    run = in_turn(missing) if executor is None else outcomes(missing, executor)
     try:
-        for unit in run:
+        for unit, _ in run:
             done += len(tiles[unit.number].shots)
             if callable(progress):
                 progress(Progress(done, shots, time.perf_counter() - start_time, stored=stored))
@@ -239,15 +239,6 @@ def remove_tiles(folder: Path) -> None:
 def stored_tiles(folder: Path) -> list[Path]:
     """Return the files of tiles in a folder."""
     return list(folder.glob(_TILE_NAME.format("[0-9a-f]" * 32)))
-
-
-def _in_turn(units: Sequence[WorkUnit]) -> Iterator[WorkUnit]:
-    """Do units of work one after the other, and yield each. **Raises:** the exception of a unit."""
-    for unit in units:
-        outcome = run_unit(unit)
-        if outcome.error is not None:
-            raise outcome.error
-        yield unit
 
 
 def _tiles(clouds: list[CloudFile], survey: Survey, edge: float, voxel_edge: np.ndarray) -> list[CloudTile]:

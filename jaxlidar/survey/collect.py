@@ -5,9 +5,10 @@ contributions of tasks, contributions are kept until all are there, and then sum
 """
 
 import dataclasses
+import itertools
 import json
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -28,7 +29,7 @@ from jaxlidar.spectral.truth_class import Truth
 from jaxlidar.survey.acquisition import Acquisition
 from jaxlidar.survey.results import EXCESS, MISSING_LIGHT, OPTIONAL_ARRAYS
 from jaxlidar.survey.shared_illumination import GroupContribution
-from jaxlidar.survey.strategy import AbstractStrategy, Shots
+from jaxlidar.survey.strategy import AbstractStrategy, Shots, SurveyTask
 from jaxlidar.survey.waveforms import Waveforms
 
 # The group of a store that has contributions until they are summed, and its number of rows of a chunk.
@@ -39,20 +40,25 @@ class ShotsInMemory:
     """Results of shots in memory.
 
     - `is_done`: (shots,) True for the shots whose results are there.
-    - `values`: results with arrays of all shots; None without any result.
+    - `values`: results with arrays of `count` rows; None without any result.
+
+    **Arguments:** `hits`: rows of the shots; the others have `fill`. None where all rows are shots.
     """
 
-    def __init__(self, count: int):
-        self.is_done = np.zeros(count, bool)
+    def __init__(self, count: int, hits: Int[np.ndarray, " hits"] | None = None, fill: float = 0.0):
+        self._count, self._fill = count, fill
+        self._rows = np.arange(count) if hits is None else hits
+        self.is_done = np.zeros(len(self._rows), bool)
         self.values: Any = None
 
     def write(self, shots: Shots, results: Any) -> None:
         """Add the results of some shots."""
         if self.values is None:
-            count = len(self.is_done)
-            self.values = jax.tree.map(lambda a: np.zeros((count, *a.shape[1:]), a.dtype), results)
+            self.values = jax.tree.map(
+                lambda a: np.full((self._count, *a.shape[1:]), self._fill, a.dtype), results
+            )
         for values, of_shots in zip(jax.tree.leaves(self.values), jax.tree.leaves(results), strict=True):
-            values[shots] = of_shots
+            values[self._rows[shots]] = of_shots
         self.is_done[shots] = True
 
 
@@ -90,11 +96,9 @@ def _stored_shots(
 class StoredContributions:
     """Contributions of tasks by number, in a store: the rows of a task are its shots."""
 
-    def __init__(self, store: ResultStore, strategy: AbstractStrategy):
-        numbers = range(strategy.n_contributions)
-        counts = [np.arange(len(strategy.survey))[strategy.shots_of_task(n)].size for n in numbers]
-        ends = np.cumsum([0, *counts]).tolist()
-        self._slices = [slice(*ends[n : n + 2]) for n in range(len(counts))]
+    def __init__(self, store: ResultStore, shots_of_tasks: Sequence[Int[np.ndarray, " shots"]]):
+        ends = np.cumsum([0, *map(len, shots_of_tasks)]).tolist()
+        self._slices = [slice(*pair) for pair in itertools.pairwise(ends)]
         self._rows = store.rows(_CONTRIBUTIONS, "row", ends[-1], _CONTRIBUTIONS_PER_CHUNK)
 
     def __contains__(self, number: int) -> bool:
@@ -130,27 +134,19 @@ class SurveyResults:
     truth: ShotsInMemory | StoredShots
     contributions: dict[int, GroupContribution] | StoredContributions
 
-    @staticmethod
-    def in_memory(strategy: AbstractStrategy) -> "SurveyResults":
-        """Return results in memory, of which none is there yet."""
-        count = len(strategy.survey)
-        return SurveyResults(strategy, ShotsInMemory(count), ShotsInMemory(count), {})
-
-    def _rows(self, number: int) -> ShotsInMemory | StoredShots:
-        return self.light if number < self.strategy.n_light_tasks else self.truth
-
-    def is_done(self, number: int) -> bool:
+    def is_done(self, task: SurveyTask) -> bool:
         """Return True for a task that need not be run."""
-        are_done = self._rows(number).is_done[self.strategy.shots_of_task(number)]
-        return number in self.contributions or bool(np.all(are_done))
+        are_done = (self.truth if task.is_truth else self.light).is_done[task.shots]
+        return task.unit.number in self.contributions or bool(np.all(are_done))
 
-    def add(self, number: int, result: Any) -> None:
+    def add(self, task: SurveyTask, result: Any) -> None:
         """Add the result of a task."""
-        results = self.strategy.results_of_task(number, result)
-        if number < self.strategy.n_contributions:
-            self.contributions[number] = results
+        if task.is_truth:
+            self.truth.write(task.shots, result)
+        elif self.strategy.contribution_sum is None:
+            self.light.write(task.shots, result)
         else:
-            self._rows(number).write(self.strategy.shots_of_task(number), results)
+            self.contributions[task.unit.number] = result
 
     def sum_contributions(self) -> None:
         """Add the light of all shots whose contributions are there."""
@@ -162,52 +158,36 @@ class SurveyResults:
                 self.light.write(shots, contribution_sum(self.contributions.__getitem__, shots))
 
 
-def at_rows(rows: Any, count: int, values: Any, fill: float = 0.0) -> Any:
-    """Return arrays with `values` in `rows` of `count` rows, and `fill` in the others; unchanged for None."""
-
-    def place(a: np.ndarray) -> np.ndarray:
-        full = np.full((count, *a.shape[1:]), fill, a.dtype)
-        full[rows] = a
-        return full
-
-    return values if rows is None else jax.tree.map(place, values)
-
-
 def waveforms_in_memory(
-    results: SurveyResults,
-    survey_fields: dict[str, Any],
-    hits: Int[np.ndarray, " hits"] | None,
-    start_time: float,
-    **info: Any,
+    results: SurveyResults, survey_fields: dict[str, Any], start_time: float, **info: Any
 ) -> Waveforms:
     """Return all waveforms from the results of all tasks.
 
-    `survey_fields`: the fields of `Waveforms` that are known before any tracing. `hits`: numbers in the
-    survey of the shots of the strategy, or None where these are all; the others are empty. `info`: further
-    entries of `Waveforms.info`.
+    `survey_fields`: the fields of `Waveforms` that are known before any tracing. `info`: further entries of
+    `Waveforms.info`.
     """
     assert isinstance(results.light, ShotsInMemory)
     assert isinstance(results.truth, ShotsInMemory)
-    count = len(survey_fields["zenith"])
-    light = at_rows(hits, count, results.light.values)
+    light = results.light.values
     refuse_excess(light[EXCESS])
     _warn_of_missing_light(results.strategy, *(light[name] for name in MISSING_LIGHT))
     fields = {**survey_fields, **_fields_of(light)}
     if results.truth.values is not None:
-        fields["truth"] = _truth(results.strategy, at_rows(hits, count, results.truth.values, np.nan))
+        fields["truth"] = _truth(results.strategy, results.truth.values)
     return _waveforms(results.strategy, fields, _info(results.strategy, start_time) | info)
 
 
 class StoredSurvey:
     """The store of a survey, with the layout of `Waveforms`: `jaxlidar.open` reads it when it is finished.
 
-    `survey_fields`, `hits`: as in `waveforms_in_memory`. `case`: that of the survey, or None.
+    `survey_fields`: as in `waveforms_in_memory`. `hits`: as in `ShotsInMemory`. `case`: that of the survey.
     """
 
     def __init__(
         self,
         store: ResultStore,
         strategy: AbstractStrategy,
+        tasks: Sequence[SurveyTask],
         survey_fields: dict[str, Any],
         hits: Int[np.ndarray, " hits"] | None,
         case: Case | None,
@@ -216,11 +196,14 @@ class StoredSurvey:
         count, chunk = len(survey_fields["zenith"]), strategy.shot_slices[0].stop
         self._light = store.rows("", "shot", count, chunk)
         light, truth = _stored_shots(self._light.is_done, self._write_light, hits), ShotsInMemory(count)
-        self._has_truth = strategy.n_tasks > strategy.n_light_tasks
+        self._has_truth = any(task.is_truth for task in tasks)
         if self._has_truth:
             self._truth = store.rows("truth", "shot", count, chunk)
             truth = _stored_shots(self._truth.is_done, self._write_truth, hits, np.nan)
-        contributions = StoredContributions(store, strategy) if strategy.n_contributions else {}
+        contributions = {}
+        if strategy.contribution_sum is not None:
+            of_light: Any = [task.shots for task in tasks if not task.is_truth]
+            contributions = StoredContributions(store, of_light)
         if damaged := store.damaged_arrays():
             warn_user(
                 f"path = {store.path} is damaged, and these arrays are made again: {', '.join(damaged)}"

@@ -42,7 +42,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from jaxlidar._jax.programs import Program
-from jaxlidar._jax.workers import WorkUnit, task
+from jaxlidar._jax.workers import task
 from jaxlidar.planning.plan import MIN_BATCHES
 from jaxlidar.planning.setup import Setup
 from jaxlidar.planning.size_buckets import size_bucket
@@ -62,7 +62,7 @@ from jaxlidar.spectral.apply_optics import (
     total_samples,
 )
 from jaxlidar.survey.results import SAMPLED_ARRAYS, ShotErrors, make_shot_results
-from jaxlidar.survey.strategy import AbstractStrategy, Shots, slices_of_shots, without_padding
+from jaxlidar.survey.strategy import AbstractStrategy, SurveyTask, slices_of_shots, without_padding
 from jaxlidar.trace.device_scene import DeviceScene, aim_at, build_device_scene
 from jaxlidar.trace.first.first_order import FirstOrderTally
 from jaxlidar.trace.first.footprint import (
@@ -244,33 +244,14 @@ class PerShotStrategy(AbstractStrategy):
         # Chunks of nearly equal size: the copies that fill up the last one are traced in vain.
         return -(-shots // -(-shots // largest))
 
-    def tasks(self, key: PRNGKeyArray) -> list[WorkUnit]:
-        return [
-            task(
-                number,
-                trace_chunk,
-                (
-                    self.context,
-                    self._chunk_geometry(shots),
-                    self.setup.plan.n_samples,
-                    self.rtol,
-                    self.kept_names,
-                ),
-                key,
-            )
-            for number, shots in enumerate(self.shot_slices)
-        ]
-
-    def _chunk_geometry(self, shots: slice) -> ShotGeometry:
-        return shot_geometry(self.survey, shots.start, shots.stop - shots.start)
-
-    @property
-    def n_tasks(self) -> int:
-        return len(self.shot_slices)
-
-    @property
-    def n_light_tasks(self) -> int:
-        return self.n_tasks
+    def tasks(self, key: PRNGKeyArray) -> list[SurveyTask]:
+        options = self.setup.plan.n_samples, self.rtol, self.kept_names
+        tasks = []
+        for number, shots in enumerate(self.shot_slices):
+            geometry = shot_geometry(self.survey, shots.start, shots.stop - shots.start)
+            unit = task(number, trace_chunk, (self.context, geometry, *options), key)
+            tasks.append(SurveyTask(unit, shots))
+        return tasks
 
     @property
     def contribution_sum(self) -> None:
@@ -279,12 +260,6 @@ class PerShotStrategy(AbstractStrategy):
     @property
     def shot_slices(self) -> list[slice]:
         return slices_of_shots(len(self.survey), self.shots_per_chunk)
-
-    def shots_of_task(self, number: int) -> Shots:
-        return self.shot_slices[number]
-
-    def results_of_task(self, number: int, result: Any) -> dict[str, Any]:
-        return result
 
     def info(self) -> dict[str, Any]:
         return {"shared": False}

@@ -46,7 +46,7 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from jaxlidar._fields.checks import as_array
 from jaxlidar._jax.programs import Program
-from jaxlidar._jax.workers import WorkUnit, task
+from jaxlidar._jax.workers import task
 from jaxlidar.planning.plan import MIN_BATCHES
 from jaxlidar.planning.setup import Setup
 from jaxlidar.sampling.adaptive import AbstractEstimate, EstimateErrors, StepRule, StoppingRule, sample_until
@@ -66,7 +66,7 @@ from jaxlidar.spectral.apply_optics import (
 )
 from jaxlidar.survey.node_groups import NodeAllocation, NodeGroup
 from jaxlidar.survey.results import ShotErrors, make_shot_results
-from jaxlidar.survey.strategy import AbstractStrategy, ContributionSum, Shots, slices_of_shots
+from jaxlidar.survey.strategy import AbstractStrategy, ContributionSum, SurveyTask, slices_of_shots
 from jaxlidar.survey.view_geometry import ViewGeometry
 from jaxlidar.trace.device_scene import DeviceScene, aim_at, build_device_scene
 from jaxlidar.trace.first.footprint import parallel_beam
@@ -125,33 +125,19 @@ class SharedIlluminationStrategy(AbstractStrategy):
         # One object for all tasks of this process: its device scene is built once.
         return make_group_context(self.setup, self.spacing, self.view_geometry)
 
-    def tasks(self, key: PRNGKeyArray) -> list[WorkUnit]:
+    def tasks(self, key: PRNGKeyArray) -> list[SurveyTask]:
         return [
-            task(number, trace_group, (self.context, group, number, self.rtol), key)
+            SurveyTask(task(number, trace_group, (self.context, group, number, self.rtol), key), group.shots)
             for number, group in enumerate(self.groups)
         ]
-
-    @property
-    def n_tasks(self) -> int:
-        return len(self.groups)
 
     @property
     def shot_slices(self) -> list[slice]:
         return slices_of_shots(len(self.survey), SHOTS_PER_BLOCK)
 
     @property
-    def n_light_tasks(self) -> int:
-        return len(self.groups)
-
-    @property
     def contribution_sum(self) -> ContributionSum:
         return self._sum_contributions
-
-    def shots_of_task(self, number: int) -> Shots:
-        return self.groups[number].shots
-
-    def results_of_task(self, number: int, result: Any) -> Any:
-        return result
 
     def _sum_contributions(self, contribution_of: Callable[[int], Any], shots: slice) -> dict[str, Any]:
         numbers = [

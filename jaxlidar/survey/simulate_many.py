@@ -42,7 +42,7 @@ from jaxlidar.scenes.scene_parts import SceneParts
 from jaxlidar.sensors.survey import Survey
 from jaxlidar.survey.acquisition import acquisition_of
 from jaxlidar.survey.choose_strategy import choose_strategy
-from jaxlidar.survey.collect import StoredSurvey, SurveyResults, at_rows, waveforms_in_memory
+from jaxlidar.survey.collect import ShotsInMemory, StoredSurvey, SurveyResults, waveforms_in_memory
 from jaxlidar.survey.coverage import (
     OffMapWarning,
     beams_are_narrow,
@@ -53,8 +53,9 @@ from jaxlidar.survey.coverage import (
     shots_on_ground,
 )
 from jaxlidar.survey.results import OPTIONAL_ARRAYS
+from jaxlidar.survey.strategy import AbstractStrategy, SurveyTask
 from jaxlidar.survey.tiled_scene import TiledSceneStrategy
-from jaxlidar.survey.truths import StrategyWithTruth
+from jaxlidar.survey.truths import truth_tasks
 from jaxlidar.survey.waveforms import Waveforms
 
 
@@ -186,14 +187,13 @@ def simulate_many(
     else:
         shots = survey if hits is None else survey.subset(hits)
         strategy = choose_strategy(shots, scene, rtol, max_orders, shared, kept_names=kept_names)
-        if truth:
-            strategy = StrategyWithTruth.around(strategy)
         setup = strategy.setup
         off_map_fractions = off_map(strategy.survey, setup.scene)
         heights = ground_heights(strategy.survey, setup.scene, setup.plan.limits.start_distance)
         if hits is not None:
-            off_map_fractions = off_map(survey, scene)
-            heights = at_rows(hits, len(survey), heights, np.nan)
+            off_map_fractions, heights_of_hits = off_map(survey, scene), heights
+            heights = np.full(len(survey), np.nan)
+            heights[hits] = heights_of_hits
     # Tiles are parts of a stand, whose sides are not looked at.
     may_miss_plants = isinstance(scene, SceneParts) or (scene.canopy is not None and is_cut_off(scene.canopy))
     if may_miss_plants and (message := off_map_message(off_map_fractions)) is not None:
@@ -211,9 +211,10 @@ def simulate_many(
     info |= {} if survey.stated is None else {"disturbed": True}
     info |= {} if hits is None else {"missed": len(survey) - len(hits)}
     if path is None:
-        results = SurveyResults.in_memory(strategy)
-        _trace(results, key, run_tasks, progress)
-        return waveforms_in_memory(results, survey_fields, hits, start_time, **info)
+        light, truths = ShotsInMemory(len(survey), hits), ShotsInMemory(len(survey), hits, np.nan)
+        results = SurveyResults(strategy, light, truths, {})
+        _trace(results, _tasks(strategy, key, truth), run_tasks, progress)
+        return waveforms_in_memory(results, survey_fields, start_time, **info)
 
     # Digests of all that the waveforms depend on: results of another problem are neither used nor
     # overwritten.
@@ -236,9 +237,10 @@ def simulate_many(
     arguments |= options | ({} if keep is None else {"keep": kept_names})
     case = None if isinstance(scene, SceneParts) else _case(survey, scene, key, arguments)
     with open_store(path, problem) as store:
-        stored_survey = StoredSurvey(store, strategy, survey_fields, hits, case)
+        tasks = _tasks(strategy, key, truth)
+        stored_survey = StoredSurvey(store, strategy, tasks, survey_fields, hits, case)
         try:
-            _trace(stored_survey.results, key, run_tasks, progress)
+            _trace(stored_survey.results, tasks, run_tasks, progress)
         except KeyboardInterrupt as error:
             error.add_note(f"finished shots are kept in {path}: the same call continues with them")
             raise
@@ -315,20 +317,27 @@ def _devices(mesh: jax.sharding.Mesh, executor: Executor | None) -> list[Any]:
     return devices
 
 
+def _tasks(strategy: AbstractStrategy, key: PRNGKeyArray, truth: bool) -> list[SurveyTask]:
+    """Return the tasks of a strategy, and those that find the truth of its shots; a tile's are its own."""
+    tasks = strategy.tasks(key)
+    if truth and not isinstance(strategy, TiledSceneStrategy):
+        tasks += truth_tasks(strategy, key, len(tasks))
+    return tasks
+
+
 def _trace(
     results: SurveyResults,
-    key: PRNGKeyArray,
+    tasks: list[SurveyTask],
     run_tasks: Callable[[list[WorkUnit]], Iterator[tuple[WorkUnit, Any]]],
     progress: ProgressOption,
 ) -> None:
     """Run the tasks without a result yet, until the results of all shots are there."""
-    tasks, shots = results.strategy.tasks(key), len(results.strategy.survey)
-    missing_tasks = [t for t in tasks if not results.is_done(t.number)]
-    n_done = len(tasks) - len(missing_tasks)
+    shots, missing_units = len(results.strategy.survey), [t.unit for t in tasks if not results.is_done(t)]
+    n_done = len(tasks) - len(missing_units)
     # Shots are counted in proportion to tasks: with shared illumination no task has shots of its own.
     start_time, stored = time.perf_counter(), shots * n_done // len(tasks)
-    for unit, result in run_tasks(missing_tasks):
-        results.add(unit.number, result)
+    for unit, result in run_tasks(missing_units):
+        results.add(tasks[unit.number], result)
         n_done += 1
         if callable(progress):
             seconds = time.perf_counter() - start_time

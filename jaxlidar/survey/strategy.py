@@ -3,7 +3,7 @@
 import abc
 import dataclasses
 from collections.abc import Callable, Collection, Mapping
-from typing import Any, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import jax
 import numpy as np
@@ -17,6 +17,18 @@ from jaxlidar.sensors.survey import Survey
 Shots: TypeAlias = slice | Int[np.ndarray, " shots"]
 # The results of one of `shot_slices`, from a function that gives the contribution of a task.
 ContributionSum: TypeAlias = Callable[[Callable[[int], Any], slice], dict[str, Any]]
+
+
+class SurveyTask(NamedTuple):
+    """A task: a unit of work, whose number is its place among all tasks, and the shots that it is about.
+
+    Its results are the light of these shots, or what it contributes to that; or the fields of their truth but
+    `time`.
+    """
+
+    unit: WorkUnit
+    shots: Shots
+    is_truth: bool = False
 
 
 @dataclasses.dataclass(frozen=True)
@@ -38,18 +50,8 @@ class AbstractStrategy(abc.ABC):
     kept_names: tuple[str, ...]
 
     @abc.abstractmethod
-    def tasks(self, key: PRNGKeyArray) -> list[WorkUnit]:
-        """Return the tasks, numbered from zero."""
-
-    @property
-    @abc.abstractmethod
-    def n_tasks(self) -> int:
-        """Number of tasks."""
-
-    @property
-    @abc.abstractmethod
-    def n_light_tasks(self) -> int:
-        """Number of tasks that trace light; those after them find the truth."""
+    def tasks(self, key: PRNGKeyArray) -> list[SurveyTask]:
+        """Return the tasks that trace light."""
 
     @property
     @abc.abstractmethod
@@ -57,22 +59,9 @@ class AbstractStrategy(abc.ABC):
         """Sum over tasks that gives the light of shots; None where each shot is one task's."""
 
     @property
-    def n_contributions(self) -> int:
-        """Number of tasks, the first ones, whose results are contributions."""
-        return 0 if self.contribution_sum is None else self.n_light_tasks
-
-    @property
     @abc.abstractmethod
     def shot_slices(self) -> list[slice]:
         """Blocks of shots that are completed or stored together; all but the last are of one size."""
-
-    @abc.abstractmethod
-    def shots_of_task(self, number: int) -> Shots:
-        """Return the shots of a task: their numbers, or a slice."""
-
-    @abc.abstractmethod
-    def results_of_task(self, number: int, result: Any) -> Any:
-        """Return what a task adds: the light or the truth of its shots alone, or a contribution."""
 
     @abc.abstractmethod
     def info(self) -> dict[str, Any]:

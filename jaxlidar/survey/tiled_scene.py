@@ -26,15 +26,15 @@ from jaxtyping import Float, Int, PRNGKeyArray
 
 from jaxlidar._constants import SPEED_OF_LIGHT
 from jaxlidar._fingerprint import digest_of
-from jaxlidar._jax.workers import WorkUnit, run_unit, task
+from jaxlidar._jax.workers import in_turn, task
 from jaxlidar.scenes.scene import check_kinds
 from jaxlidar.scenes.scene_parts import SceneParts
 from jaxlidar.sensors.survey import Survey
 from jaxlidar.survey.choose_strategy import choose_strategy
 from jaxlidar.survey.collect import ShotsInMemory, SurveyResults
 from jaxlidar.survey.coverage import ground_heights, off_map
-from jaxlidar.survey.strategy import AbstractStrategy, Shots, slices_of_shots
-from jaxlidar.survey.truths import StrategyWithTruth
+from jaxlidar.survey.strategy import AbstractStrategy, SurveyTask, slices_of_shots
+from jaxlidar.survey.truths import truth_tasks
 
 # Radius within which a Gaussian beam is followed, over its 1/e^2 radius; 2e-8 of its energy lies beyond. It
 # is larger than in `footprint_splines`: what lies outside the rectangle is missing altogether.
@@ -54,7 +54,10 @@ class SceneTile(NamedTuple):
 
 
 class TileOptions(NamedTuple):
-    """Arguments of `simulate_many` for all tiles; `window`: times of the first and the last sample, ns."""
+    """Arguments of `simulate_many` for all tiles, and what the results of all tiles have in common.
+
+    `window`: times of the first and the last sample, ns. `materials`, `surfaces`: names, of all parts.
+    """
 
     rtol: float | None
     orders: int
@@ -62,6 +65,8 @@ class TileOptions(NamedTuple):
     window: tuple[float, float]
     truth: bool
     kept_names: tuple[str, ...]
+    materials: tuple[str, ...] = ()
+    surfaces: tuple[str, ...] = ()
 
 
 def tiles_of(survey: Survey, scene: SceneParts, margin: float = 0.0) -> list[SceneTile]:
@@ -108,17 +113,11 @@ def lossless_margin(survey: Survey, longest_path: float, top: float) -> float:
     return float(max((longest_path + 2.0 * top / np.cos(zenith)) / (1.0 - np.sin(zenith)), 0.0))
 
 
-def subset(survey: Survey, shots: Int[np.ndarray, " shots"]) -> Survey:
-    """Return the shots of a survey with these numbers."""
-    return survey.subset(shots)
-
-
 @dataclasses.dataclass(frozen=True)
 class TiledSceneStrategy(AbstractStrategy):
     """A task traces the shots of a tile over its part of the scene; further tasks find their truth.
 
     - `setup`: of the first tile. - `tiles`: with their margins.
-    - `materials`, `surfaces`: names of those of all parts.
     - `off_map`, `ground_height`: (shots,), as in `Waveforms`. - `digests`: of all parts.
     - `margin`, `lossless_margin`: m, the one in use and the one that loses no light.
     """
@@ -126,8 +125,6 @@ class TiledSceneStrategy(AbstractStrategy):
     scene: SceneParts
     tiles: list[SceneTile]
     options: TileOptions
-    materials: tuple[str, ...]
-    surfaces: tuple[str, ...]
     off_map: Float[np.ndarray, " shots"]
     ground_height: Float[np.ndarray, " shots"]
     digests: list[str]
@@ -201,9 +198,7 @@ class TiledSceneStrategy(AbstractStrategy):
             kept_names=kept_names,
             scene=scene,
             tiles=tiles,
-            options=options,
-            materials=tuple(materials),
-            surfaces=tuple(surfaces),
+            options=options._replace(materials=tuple(materials), surfaces=tuple(surfaces)),
             off_map=off_map_fractions,
             ground_height=heights,
             digests=digests,
@@ -212,58 +207,23 @@ class TiledSceneStrategy(AbstractStrategy):
             shared=all(shared_by_tile),
         )
 
-    def tasks(self, key: PRNGKeyArray) -> list[WorkUnit]:
+    def tasks(self, key: PRNGKeyArray) -> list[SurveyTask]:
         # Tasks get the function that returns parts, not the parts: all of them would fill the memory.
-        arguments = [(self.survey, self.scene, tile, n, self.options) for n, tile in enumerate(self.tiles)]
-        tasks = [task(n, trace_tile, tile_arguments, key) for n, tile_arguments in enumerate(arguments)]
-        if self.options.truth:
-            tasks += [
-                task(n, truth_of_tile, tile_arguments, key)
-                for n, tile_arguments in enumerate(arguments, len(arguments))
-            ]
+        tasks = []
+        for function in (trace_tile, truth_of_tile) if self.options.truth else (trace_tile,):
+            for n, tile in enumerate(self.tiles):
+                arguments = self.survey, self.scene, tile, n, self.options
+                unit = task(len(tasks), function, arguments, key)
+                tasks.append(SurveyTask(unit, tile.shots, is_truth=function is truth_of_tile))
         return tasks
-
-    @property
-    def n_tasks(self) -> int:
-        return len(self.tiles) * (2 if self.options.truth else 1)
 
     @property
     def shot_slices(self) -> list[slice]:
         return slices_of_shots(len(self.survey), _SHOTS_PER_BLOCK)
 
     @property
-    def n_light_tasks(self) -> int:
-        return len(self.tiles)
-
-    @property
     def contribution_sum(self) -> None:
         return None
-
-    def shots_of_task(self, number: int) -> Shots:
-        return self.tiles[number % len(self.tiles)].shots
-
-    def results_of_task(self, number: int, result: Any) -> Any:
-        """Return the results of a tile, with zeros for the materials that its part of the scene lacks."""
-        if number >= self.n_light_tasks:
-            return self._truths_of_tile(result)
-        results: dict[str, Any] = dict(result)
-        fates = [f"absorbed by {material}" for material in self.materials]
-        names = {"components": self.materials, "energy_budget": fates, "energy_budget_stderr": fates}
-        for field in names.keys() & results.keys():
-            arrays = results[field]
-            no_light = np.zeros_like(next(iter(arrays.values())))
-            results[field] = _in_order_of_names(arrays, names[field], no_light)
-        return results
-
-    def _truths_of_tile(self, truths: dict[str, Any]) -> dict[str, Any]:
-        no_height = np.full(len(truths["top_height"]), np.nan)
-        samples, n_wavelengths = truths["gap_probability"], self.survey.lidar.wavelength.size
-        nothing = np.zeros((len(samples), n_wavelengths, self.setup.plan.n_samples), samples.dtype)
-        return truths | {
-            "returns": _in_order_of_names(truths["returns"], self.materials, nothing),
-            "surface_height": _in_order_of_names(truths["surface_height"], self.surfaces, no_height),
-            "surface_spread": _in_order_of_names(truths["surface_spread"], self.surfaces, no_height),
-        }
 
     def info(self) -> dict[str, Any]:
         return {
@@ -289,7 +249,7 @@ def _strategy_of(
     try:
         check_kinds(survey.lidar, scene_part)
         return choose_strategy(
-            subset(survey, tile.shots), scene_part, rtol, orders, shared, window, kept_names
+            survey.subset(tile.shots), scene_part, rtol, orders, shared, window, kept_names
         )
     except ValueError as error:
         corners = f"part({tile.low.tolist()}, {tile.high.tolist()})"
@@ -320,16 +280,24 @@ def trace_tile(
     options: TileOptions,
     key: PRNGKeyArray,
 ) -> dict[str, Any]:
-    """Trace the shots of a tile."""
+    """Trace the shots of a tile. Materials that its part of the scene lacks have zeros."""
     # With the window and the orders of all tiles the strategy comes out as in `TiledSceneStrategy.of`.
     strategy = _strategy_of_tile(survey, scene, tile, options)
-    task_results = _run_in_turn(strategy.tasks(jax.random.fold_in(key, number)))
-    results = SurveyResults.in_memory(strategy)
-    for task_number, result in task_results.items():
-        results.add(task_number, result)
-    results.sum_contributions()
-    assert isinstance(results.light, ShotsInMemory)
-    return results.light.values
+    tasks = strategy.tasks(jax.random.fold_in(key, number))
+    light = ShotsInMemory(len(tile.shots))
+    survey_results = SurveyResults(strategy, light, ShotsInMemory(0), {})
+    # One after the other: the task of a tile has one core.
+    for part, (_, result) in zip(tasks, in_turn([part.unit for part in tasks])):
+        survey_results.add(part, result)
+    survey_results.sum_contributions()
+    results: dict[str, Any] = dict(light.values)
+    fates = [f"absorbed by {material}" for material in options.materials]
+    names = {"components": options.materials, "energy_budget": fates, "energy_budget_stderr": fates}
+    for field in names.keys() & results.keys():
+        arrays = results[field]
+        no_light = np.zeros_like(next(iter(arrays.values())))
+        results[field] = _in_order_of_names(arrays, names[field], no_light)
+    return results
 
 
 def truth_of_tile(
@@ -342,18 +310,15 @@ def truth_of_tile(
 ) -> dict[str, Any]:
     """Return the fields of the truth of the shots of a tile, as `truths_of_chunk` does."""
     strategy = _strategy_of_tile(survey, scene, tile, options)
-    chunks = _run_in_turn(StrategyWithTruth.around(strategy).truth_tasks(key))
-    truths = jax.tree.map(lambda *a: np.concatenate(a), *(chunk for _, chunk in sorted(chunks.items())))
+    chunks = [chunk for _, chunk in in_turn([part.unit for part in truth_tasks(strategy, key)])]
+    truths = jax.tree.map(lambda *a: np.concatenate(a), *chunks)
     # The last chunk is as large as the others, and filled up.
-    return jax.tree.map(lambda a: a[: len(tile.shots)], truths)
-
-
-def _run_in_turn(tasks: list[WorkUnit]) -> dict[int, Any]:
-    """Return the results of tasks by number, one after the other: the task of a tile has one core."""
-    results = {}
-    for unit in tasks:
-        outcome = run_unit(unit)
-        if outcome.error is not None:
-            raise outcome.error
-        results[unit.number] = outcome.arrays
-    return results
+    truths = jax.tree.map(lambda a: a[: len(tile.shots)], truths)
+    no_height = np.full(len(tile.shots), np.nan)
+    samples, n_wavelengths = truths["gap_probability"], survey.lidar.wavelength.size
+    nothing = np.zeros((len(samples), n_wavelengths, strategy.setup.plan.n_samples), samples.dtype)
+    return truths | {
+        "returns": _in_order_of_names(truths["returns"], options.materials, nothing),
+        "surface_height": _in_order_of_names(truths["surface_height"], options.surfaces, no_height),
+        "surface_spread": _in_order_of_names(truths["surface_spread"], options.surfaces, no_height),
+    }

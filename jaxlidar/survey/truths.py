@@ -1,6 +1,5 @@
 """Truth of the shots of a survey: reference quantities of what each beam meets in the scene."""
 
-import dataclasses
 from typing import Any
 
 import jax
@@ -8,7 +7,7 @@ import numpy as np
 from jaxtyping import Array, PRNGKeyArray
 
 from jaxlidar._jax.programs import Program
-from jaxlidar._jax.workers import WorkUnit, task
+from jaxlidar._jax.workers import task
 from jaxlidar.simulation.truth import compute_labels, first_order_setup
 from jaxlidar.survey.per_shot import (
     ShotGeometry,
@@ -18,7 +17,7 @@ from jaxlidar.survey.per_shot import (
     shot_geometry,
     shots_to_trace,
 )
-from jaxlidar.survey.strategy import AbstractStrategy, ContributionSum, Shots, without_padding
+from jaxlidar.survey.strategy import AbstractStrategy, SurveyTask, without_padding
 
 # Fields of `Truth` with an axis of samples.
 _SAMPLED_FIELDS = (
@@ -31,68 +30,18 @@ _SAMPLED_FIELDS = (
 )
 
 
-@dataclasses.dataclass(frozen=True)
-class StrategyWithTruth(AbstractStrategy):
-    """A strategy that traces light, and the truth of all shots.
+def truth_tasks(strategy: AbstractStrategy, key: PRNGKeyArray, first: int = 0) -> list[SurveyTask]:
+    """Return tasks that find the truth of a strategy's blocks of shots, numbered from `first` on.
 
-    After the tasks of `light_strategy`, there is one for the truth of each of its blocks of shots.
+    They draw no random numbers: `key` is passed on unused.
     """
-
-    light_strategy: AbstractStrategy
-
-    @staticmethod
-    def around(light: AbstractStrategy) -> "StrategyWithTruth":
-        """Return a strategy that traces light, with the truth of its shots."""
-        return StrategyWithTruth(light.setup, light.survey, light.rtol, light.kept_names, light)
-
-    @property
-    def shot_slices(self) -> list[slice]:
-        return self.light_strategy.shot_slices
-
-    def tasks(self, key: PRNGKeyArray) -> list[WorkUnit]:
-        return [*self.light_strategy.tasks(key), *self.truth_tasks(key)]
-
-    def truth_tasks(self, key: PRNGKeyArray) -> list[WorkUnit]:
-        """Return the tasks for the truth alone. They draw no random numbers: `key` is passed on unused."""
-        context, n_samples = make_survey_context(first_order_setup(self.setup)), self.setup.plan.n_samples
-        return [
-            task(
-                number,
-                truths_of_chunk,
-                (context, shot_geometry(self.survey, shots.start, shots.stop - shots.start), n_samples),
-                key,
-            )
-            for number, shots in enumerate(self.shot_slices, self.light_strategy.n_tasks)
-        ]
-
-    @property
-    def n_tasks(self) -> int:
-        return self.light_strategy.n_tasks + len(self.shot_slices)
-
-    @property
-    def n_light_tasks(self) -> int:
-        return self.light_strategy.n_tasks
-
-    @property
-    def contribution_sum(self) -> ContributionSum | None:
-        return self.light_strategy.contribution_sum
-
-    def shots_of_task(self, number: int) -> Shots:
-        n_light = self.n_light_tasks
-        return (
-            self.light_strategy.shots_of_task(number)
-            if number < n_light
-            else self.shot_slices[number - n_light]
-        )
-
-    def results_of_task(self, number: int, result: Any) -> Any:
-        n_light = self.n_light_tasks
-        if number < n_light:
-            return self.light_strategy.results_of_task(number, result)
-        return result
-
-    def info(self) -> dict[str, Any]:
-        return self.light_strategy.info()
+    setup, tasks = strategy.setup, []
+    context = make_survey_context(first_order_setup(setup))
+    for number, shots in enumerate(strategy.shot_slices, first):
+        geometry = shot_geometry(strategy.survey, shots.start, shots.stop - shots.start)
+        unit = task(number, truths_of_chunk, (context, geometry, setup.plan.n_samples), key)
+        tasks.append(SurveyTask(unit, shots, is_truth=True))
+    return tasks
 
 
 def truths_of_chunk(
