@@ -69,9 +69,8 @@ from jaxlidar.formats.las import LasWriter, write_las
 from jaxlidar.planning.channels import unnumbered
 from jaxlidar.progress import Progress, ProgressOption
 from jaxlidar.scenes.scene import Scene
-from jaxlidar.sensors.lidar import Lidar
 from jaxlidar.sensors.survey import Survey, beam_directions
-from jaxlidar.survey.acquisition import PULSE_OVERSAMPLING, Acquisition, acquisition_of
+from jaxlidar.survey.acquisition import PULSE_OVERSAMPLING, Acquisition
 from jaxlidar.survey.labels import labels_of
 
 DETECTORS = ("peak", "constant fraction", "leading edge", "decomposition")
@@ -505,50 +504,6 @@ def warn_of_expected_returns(waves: DetectorInput) -> None:
             "are of the light that is expected of leaves, so that hardly any shot has none; leaf_mesh makes "
             "leaves that are hit or missed"
         )
-
-
-def input_of_waveform(wave: Any, lidar: Any, wavelength: Any) -> DetectorInput:
-    """Return the input of a `Waveform` and its lidar. **Raises:** as `Waveform.returns`."""
-    check_kind("lidar", lidar, Lidar, "the Lidar of the waveform")
-    if wave.has_scenes:
-        raise ValueError(f"the waveform has {len(wave)} scenes; admissible is that of one, as in wave[0]")
-    if not np.array_equal(np.asarray(lidar.wavelength), np.asarray(wave.wavelength)):
-        raise ValueError(
-            f"lidar has {np.asarray(lidar.wavelength).tolist()} nm, the waveform "
-            f"{np.asarray(wave.wavelength).tolist()} nm"
-        )
-    # Waveforms of earlier versions, and of JAX transformations, do not say where they were recorded.
-    if "altitude" in wave.info and (wave.info["altitude"] is None) != lidar.has_sensor_position:
-        kinds = ("its altitude", "its sensor")
-        raise ValueError(
-            f"lidar is placed by {kinds[lidar.has_sensor_position]}, that of the waveform by "
-            f"{kinds[not lidar.has_sensor_position]}; admissible is the lidar that was simulated"
-        )
-    w = wavelength_index(wavelength, np.asarray(wave.wavelength, float))
-    shot = Survey.of(lidar)
-    acquisition = acquisition_of(shot)
-
-    def row(array: Any) -> np.ndarray:
-        return np.asarray(array)[w][None]
-
-    truth = wave.truth
-    heights = {} if truth is None else truth.surface_height
-    heights = {name: np.asarray(height, float).reshape(1) for name, height in heights.items()}
-    return DetectorInput(
-        time=np.asarray(wave.time, float),
-        recorded=row(wave.recorded),
-        energy=row(wave.energy),
-        stderr=row(wave.stderr),
-        components={name: row(a) for name, a in wave.components.items() if name not in _ORDERS},
-        truth=None if truth is None else {name: row(a) for name, a in truth.returns.items()},
-        surface_height=heights,
-        axes=_shot_axes(shot.position, shot.zenith, shot.azimuth, acquisition.range_at_time_zero),
-        acquisition=acquisition,
-        constant=float(acquisition.radiometric_constant[w]),
-        receiver_noise=float(acquisition.noise[w]),
-        # The truth has the mean height of the ground over the footprint.
-        ground_height=heights.get("ground", np.full(1, np.nan)),
-    )
 
 
 # -- detection ---------------------------------------------------------------------------------------------

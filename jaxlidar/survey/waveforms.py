@@ -5,12 +5,13 @@ import os
 from typing import Any, final
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import ArrayLike, Float, Int
 
 from jaxlidar._constants import SPEED_OF_LIGHT
-from jaxlidar._fields.checks import check_index, check_numbers, warn_user
+from jaxlidar._fields.checks import check_index, check_kind, check_numbers, warn_user
 from jaxlidar._fields.crs import common_system
 from jaxlidar._not_kept import NotKept
 from jaxlidar._registry import detect_returns, true_returns
@@ -25,18 +26,17 @@ from jaxlidar.results.datasets import datasets_of, keep_as_netcdf
 from jaxlidar.results.netcdf import WAVEFORM_QUANTITIES
 from jaxlidar.sampling.adaptive import StopReason
 from jaxlidar.sensors.lidar import Lidar
-from jaxlidar.sensors.survey import beam_directions
+from jaxlidar.sensors.survey import Survey, beam_directions
 from jaxlidar.spectral.summary import neglected_fractions
 from jaxlidar.spectral.truth_class import Truth
 from jaxlidar.spectral.waveform import Waveform
-from jaxlidar.survey.acquisition import Acquisition
+from jaxlidar.survey.acquisition import Acquisition, acquisition_of
 from jaxlidar.survey.results import OPTIONAL_ARRAYS
 from jaxlidar.survey.returns import (
     MAX_LAS_RETURNS,
     DetectorFunction,
     DiscreteReturns,
     airborne_shots,
-    input_of_waveform,
     input_of_waveforms,
     returns_of,
     strongest_returns,
@@ -529,28 +529,60 @@ keep_as_netcdf(
 
 @detect_returns.register
 def _returns_of_waveform(
-    wave: Waveform,
-    lidar: Lidar,
-    detector: str | DetectorFunction,
-    *,
-    record: Any = None,
-    wavelength: Any = None,
-    **options: Any,
+    wave: Waveform, lidar: Lidar, detector: str | DetectorFunction, *, record: Any = None, **options: Any
 ) -> DiscreteReturns:
     """Detect the returns of one waveform; see `Waveform.returns`."""
-    waves = input_of_waveform(wave, lidar, wavelength)
+    waves = _waveforms_of_one(wave, lidar)
     if record is not None:
         check_numbers("record", record)
-        record = _at_wavelength(np.asarray(record)[None], wave.wavelength, wavelength)
-    return returns_of(waves, detector, record=record, **options)
+        record = np.asarray(record)[None]
+    return waves.returns(detector, record=record, **options)
 
 
 @true_returns.register
-def _true_returns_of_waveform(
-    wave: Waveform, lidar: Lidar, *, wavelength: Any = None, **options: Any
-) -> DiscreteReturns:
+def _true_returns_of_waveform(wave: Waveform, lidar: Lidar, **options: Any) -> DiscreteReturns:
     """List the true echoes of one waveform; see `Waveform.true_returns`."""
-    return true_returns_of(input_of_waveform(wave, lidar, wavelength), **options)
+    return _waveforms_of_one(wave, lidar).true_returns(**options)
+
+
+def _waveforms_of_one(wave: Waveform, lidar: Lidar) -> Waveforms:
+    """Return a waveform and its lidar as the survey of one shot. **Raises:** as `Waveform.returns`."""
+    check_kind("lidar", lidar, Lidar, "the Lidar of the waveform")
+    if wave.has_scenes:
+        raise ValueError(f"the waveform has {len(wave)} scenes; admissible is that of one, as in wave[0]")
+    if not np.array_equal(np.asarray(lidar.wavelength), np.asarray(wave.wavelength)):
+        raise ValueError(
+            f"lidar has {np.asarray(lidar.wavelength).tolist()} nm, the waveform "
+            f"{np.asarray(wave.wavelength).tolist()} nm"
+        )
+    # Waveforms of earlier versions, and of JAX transformations, do not say where they were recorded.
+    if "altitude" in wave.info and (wave.info["altitude"] is None) != lidar.has_sensor_position:
+        kinds = ("its altitude", "its sensor")
+        raise ValueError(
+            f"lidar is placed by {kinds[lidar.has_sensor_position]}, that of the waveform by "
+            f"{kinds[not lidar.has_sensor_position]}; admissible is the lidar that was simulated"
+        )
+    shot, zero = Survey.of(lidar), np.zeros(1)
+    arrays: dict[str, Any] = {
+        name: getattr(wave, name) for name in (*OPTIONAL_ARRAYS, "neglected", "lost", "truth")
+    }
+    arrays = jax.tree.map(lambda a: np.asarray(a)[None], arrays)
+    # The truth has the mean height of the ground over the footprint.
+    heights = {} if wave.truth is None else arrays["truth"].surface_height
+    return Waveforms(
+        time=np.asarray(wave.time),
+        wavelength=np.asarray(wave.wavelength),
+        **arrays,
+        position=shot.position,
+        zenith=shot.zenith,
+        azimuth=shot.azimuth,
+        ground_height=heights.get("ground", np.full(1, np.nan)),
+        off_map=zero,
+        error=zero,
+        photons=np.zeros(1, int),
+        info={},
+        acquisition=acquisition_of(shot),
+    )
 
 
 def _at_wavelength(record: Any, wavelengths: Any, wavelength: Any) -> np.ndarray:
