@@ -197,9 +197,7 @@ def nothing_observed(plan: Plan, noise: object, lidar: Lidar) -> ObservedWavefor
     **Raises:** ValueError for noise that is not above 0.
     """
     time = sample_times(plan)
-    sigma = as_noise(noise, (lidar.wavelength.size, time.size))
-    if not np.all(sigma > 0):
-        raise ValueError(f"noise = {np.min(sigma):g} is outside the admissible range (0, inf]")
+    sigma = as_positive_noise(noise, (lidar.wavelength.size, time.size))
     return ObservedWaveform(time, np.zeros(sigma.shape), sigma)
 
 
@@ -211,6 +209,16 @@ def as_noise(noise: object, shape: tuple[int, ...]) -> np.ndarray:
         return np.broadcast_to(sigma, shape).copy()
     except ValueError:
         raise ValueError(f"noise has the shape {sigma.shape}, which does not broadcast to {shape}") from None
+
+
+def as_positive_noise(noise: object, shape: tuple[int, ...]) -> np.ndarray:
+    """Return the same. **Raises:** ValueError as well for noise that is not above 0."""
+    sigma = as_noise(noise, shape)
+    # Written so that NaN is refused.
+    is_refused = ~(sigma > 0)
+    if np.any(is_refused):
+        raise ValueError(f"noise = {sigma[is_refused].flat[0]:g} is outside the admissible range (0, inf]")
+    return sigma
 
 
 def as_sample_times(time: object, lidar: Lidar) -> Float[np.ndarray, " bins"]:

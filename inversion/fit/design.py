@@ -43,12 +43,11 @@ import numpy as np
 import scipy
 from jaxtyping import Array, ArrayLike, Bool, Float, PRNGKeyArray
 
-from inversion.fit.data import with_fixed_window
+from inversion.fit.data import as_positive_noise, with_fixed_window
 from inversion.fit.design_trace import DivergenceNodes, TracedScene, refine_nodes, trace_for_design
 from inversion.fit.identifiability import CramerRao
 from inversion.fit.planning import N_BATCHES
 from inversion.fit.unknowns import (
-    BoundUnknown,
     Setter,
     Unknown,
     bind_unknowns,
@@ -105,6 +104,8 @@ _REJECTED_COST = 1e6
 # relative to it, or by less than the second number.
 _ROUNDINGS, _FINEST_TOLERANCE = 4.0, 2e-9
 
+# Traces all scenes of a design by a lidar: at its own divergence (None), or at those of nodes.
+Tracer = Callable[[Lidar, DivergenceNodes | None], list[TracedScene]]
 Noise = ArrayLike | Callable[[Lidar, Array], Array] | None
 Cost = Callable[[CramerRao], Array]
 
@@ -191,33 +192,6 @@ class FreeValues(NamedTuple):
 
 
 @final
-class _SceneTracer(eqx.Module):
-    """Traces the scenes of a design, with the same random numbers for every lidar.
-
-    - `scenes`, `unknowns`: of each scene its unknowns. - `plan`: for all. - `n_samples`: as of `TracedScene`.
-    """
-
-    scenes: list[Scene]
-    unknowns: list[list[BoundUnknown]]
-    plan: Plan
-    n_samples: int | None
-    key: PRNGKeyArray
-
-    def trace(self, lidar: Lidar, nodes: DivergenceNodes | None = None) -> list[TracedScene]:
-        """Trace each scene by a lidar: at its own divergence (None), or at those of nodes."""
-        return [
-            trace_for_design(
-                lidar, scene, self.plan, unknowns, self.key, n_samples=self.n_samples, nodes=nodes
-            )
-            for scene, unknowns in zip(self.scenes, self.unknowns)
-        ]
-
-    def refine(self, traced_scenes: list[TracedScene]) -> list[TracedScene]:
-        """Trace each scene at one more divergence between every two nodes."""
-        return [refine_nodes(traced, self.key) for traced in traced_scenes]
-
-
-@final
 class _DesignProblem(eqx.Module):
     """The cost of a lidar as a function of its free values, and its minimisation.
 
@@ -247,8 +221,9 @@ class _DesignProblem(eqx.Module):
     def scene_cost(self, flat: Array, traced: TracedScene, noise: Any) -> Array:
         """Return the cost of one scene."""
         bound = self.bound(flat, traced, noise)
-        cost = _relative_variance(bound, traced) if self.cost_of_bound is None else self.cost_of_bound(bound)
-        return jnp.asarray(cost).reshape(())
+        if self.cost_of_bound is None:
+            return jnp.sum(jnp.diag(bound.covariance) / traced.width**2)
+        return jnp.asarray(self.cost_of_bound(bound)).reshape(())
 
     def bounds(self, flat: np.ndarray, traced_scenes: list[TracedScene]) -> tuple[CramerRao, ...]:
         """Return the bounds of all scenes."""
@@ -315,7 +290,7 @@ class _DesignProblem(eqx.Module):
         return np.where(is_divergence, near_low, lower), np.where(is_divergence, near_high, upper)
 
     def trace_divergences(
-        self, tracer: _SceneTracer, lower: np.ndarray, upper: np.ndarray, flat: np.ndarray, tolerance: float
+        self, trace: Tracer, lower: np.ndarray, upper: np.ndarray, flat: np.ndarray, tolerance: float
     ) -> list[TracedScene]:
         """Trace divergences between fractions of the limits, until the cost is known between them.
 
@@ -328,9 +303,9 @@ class _DesignProblem(eqx.Module):
         is_divergence = self.free_values.is_value_of("divergence")
         low, high = (self.free_values.at_fraction(end)[is_divergence] for end in (lower, upper))
         nodes: Any = DivergenceNodes(float(low[0]), float(high[0]), _FIRST_NODES)
-        traced_scenes = tracer.trace(self.lidar, nodes)
+        traced_scenes = trace(self.lidar, nodes)
         while True:
-            refined_scenes = tracer.refine(traced_scenes)
+            refined_scenes = [refine_nodes(traced) for traced in traced_scenes]
             nodes = refined_scenes[0].nodes
             candidates = [np.where(is_divergence, new, flat) for new in nodes.divergences[1::2]]
             interpolated, exact = (
@@ -349,14 +324,7 @@ class _DesignProblem(eqx.Module):
                 return traced_scenes
 
 
-@Program
-def _bound(problem: _DesignProblem, flat: Array, traced: TracedScene, noise: Any) -> CramerRao:
-    return problem.bound(flat, traced, noise)
-
-
-@Program
-def _scene_cost(problem: _DesignProblem, flat: Array, traced: TracedScene, noise: Any) -> Array:
-    return problem.scene_cost(flat, traced, noise)
+_bound, _scene_cost = Program(_DesignProblem.bound), Program(_DesignProblem.scene_cost)
 
 
 @Program
@@ -479,8 +447,17 @@ def design(
         _check_wavelengths_act_late(scenes)
     plan = _plan(lidar, scenes, free_values, max_orders, n_photons, n_rays)
     photon_key, start_key = jax.random.split(key)
-    tracer = _SceneTracer(scenes, bound_unknowns, plan, _number_of_samples(plan, free_values), photon_key)
-    traced_scenes = tracer.trace(lidar)
+    n_samples = _number_of_samples(plan, free_values)
+
+    def trace(lidar: Lidar, nodes: DivergenceNodes | None) -> list[TracedScene]:
+        # The same random numbers for every lidar.
+        options: dict[str, Any] = {"n_samples": n_samples, "nodes": nodes}
+        return [
+            trace_for_design(lidar, scene, plan, unknowns, photon_key, **options)
+            for scene, unknowns in zip(scenes, bound_unknowns)
+        ]
+
+    traced_scenes = trace(lidar, None)
     problem = _DesignProblem(
         lidar,
         free_values,
@@ -496,7 +473,7 @@ def design(
     lower, upper = np.zeros_like(start), np.ones_like(start)
     varies_divergence = "divergence" in free_values.paths
     if varies_divergence:
-        traced_scenes = problem.trace_divergences(tracer, lower, upper, start, _COARSE_TOLERANCE)
+        traced_scenes = problem.trace_divergences(trace, lower, upper, start, _COARSE_TOLERANCE)
     drawn = np.asarray(jax.random.uniform(start_key, (starts - 1, start.size)), float)
     # The cost has minima at each absorption band: one start would end in the next of them.
     ends = [
@@ -511,13 +488,13 @@ def design(
         # Once more from the best, between divergences near it: there the interpolation is accurate.
         flat = free_values.at_fraction(best.x)
         lower, upper = problem.limits_near(flat, lower, upper)
-        traced_scenes = problem.trace_divergences(tracer, lower, upper, flat, _FINE_TOLERANCE)
+        traced_scenes = problem.trace_divergences(trace, lower, upper, flat, _FINE_TOLERANCE)
         best = problem.minimise(best.x, traced_scenes, lower, upper, max_steps)
     flat = free_values.at_fraction(np.clip(best.x, 0.0, 1.0))
     best_lidar, best_cost = free_values.lidar_with(lidar, jnp.asarray(flat)), float(np.exp(best.fun))
     if varies_divergence:
         # Traced at the divergence that was found: without the error of the interpolation.
-        traced_scenes = tracer.trace(best_lidar)
+        traced_scenes = trace(best_lidar, None)
         best_cost = problem.mean_cost(flat, traced_scenes)
     best_values = [np.asarray(value, float) for value in free_values.of(best_lidar)]
     return Design(
@@ -640,16 +617,9 @@ def _noise_of_samples(
             return jax.tree_util.Partial(
                 _white_noise, jnp.asarray(noise / math.sqrt(float(lidar.sampling_interval)))
             )
-    sigma = as_numpy(noise, "noise")
     # Samples of a free interval have no fixed place in the record.
     shape = (lidar.wavelength.size, 1 if is_free else plan.n_samples)
-    try:
-        sigma = np.broadcast_to(sigma, shape)
-    except ValueError:
-        raise ValueError(f"noise has the shape {sigma.shape}, which does not broadcast to {shape}") from None
-    if not np.all(sigma > 0):
-        raise ValueError(f"noise = {np.min(sigma):g} is outside the admissible range (0, inf]")
-    return jnp.asarray(sigma)
+    return jnp.asarray(as_positive_noise(noise, shape))
 
 
 _record = Program(TracedScene.record)
@@ -661,11 +631,6 @@ def _white_noise(density: Array, lidar: Lidar, reflectance: Array) -> Array:
     `density`: standard deviation of a sample of 1 ns.
     """
     return density * jnp.sqrt(lidar.sampling_interval) * jnp.ones_like(reflectance)
-
-
-def _relative_variance(bound: CramerRao, traced: TracedScene) -> Array:
-    """Return the default cost: the sum of squared standard errors over the widths of the bounds."""
-    return jnp.sum(jnp.diag(bound.covariance) / traced.width**2)
 
 
 def _cramer_rao(

@@ -70,7 +70,7 @@ class DivergenceNodes(eqx.Module):
 class TracedScene(eqx.Module):
     """One scene of a design: its response, the derivatives of that, and what the bound needs besides.
 
-    - `inputs`, `values`: of the simulation at the unknowns' starting values.
+    - `inputs`, `values`, `key`: of the simulation at the unknowns' starting values.
     - `nodes`: divergences of the traces; None for one trace, of the divergence of the lidar.
     - `responses`, `slopes`: the mean response of each node, and its derivatives; the latter with another axis
       of unknowns after that of nodes, zeros for those that do not change it.
@@ -81,6 +81,7 @@ class TracedScene(eqx.Module):
 
     inputs: SimulationInputs
     values: Values
+    key: PRNGKeyArray
     n_samples: int | None = eqx.field(static=True)
     nodes: DivergenceNodes | None
     responses: Response
@@ -131,6 +132,7 @@ def trace_for_design(
     return TracedScene(
         inputs,
         values,
+        key,
         n_samples,
         nodes,
         responses,
@@ -140,11 +142,11 @@ def trace_for_design(
     )
 
 
-def refine_nodes(traced: TracedScene, key: PRNGKeyArray) -> TracedScene:
+def refine_nodes(traced: TracedScene) -> TracedScene:
     """Return the scene traced at one more node in each gap, with the same random numbers."""
     assert traced.nodes is not None
     nodes = traced.nodes.refined
-    new = _trace_divergences(traced.inputs, traced.values, nodes.divergences[1::2], key)
+    new = _trace_divergences(traced.inputs, traced.values, nodes.divergences[1::2], traced.key)
 
     def merge(before: Array, between: Array) -> Array:
         merged = jnp.zeros((nodes.count, *before.shape[1:]), before.dtype)

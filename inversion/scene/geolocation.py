@@ -59,6 +59,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import ArrayLike, Float, Int, PRNGKeyArray
 
+from inversion.fit.data import as_positive_noise
 from jaxlidar import SPEED_OF_LIGHT, OffMapWarning, Scene, Survey, Terrain, Waveforms, simulate_many
 from jaxlidar.extend import (
     as_numpy,
@@ -303,18 +304,20 @@ def _observed_records(
                 f"survey.lidar has {survey.lidar.wavelength.size} wavelengths; admissible with an array "
                 "(shots, samples) is one"
             )
-        heights = _broadcast("height", as_numpy(height, "height"), power.shape)
+        heights = as_numpy(height, "height")
+        if heights.shape not in (power.shape, power.shape[1:]):
+            raise ValueError(
+                f"height has shape {heights.shape}; admissible is that of records, {power.shape}, or of one"
+            )
+        heights = np.broadcast_to(heights, power.shape)
         power = power[:, None]
     if len(power) != len(survey) or len(power) < 2:
         raise ValueError(
             f"records have {len(power)} shots and survey {len(survey)}; admissible are as many, at least 2"
         )
     check_numbers("noise", noise)
-    sigma = as_numpy(noise, "noise")
-    if not np.all(sigma > 0):
-        raise ValueError(f"noise = {np.min(sigma):g} is outside the admissible range (0, inf]")
     shape = power.shape if isinstance(records, Waveforms) else power[:, 0].shape
-    sigma = _broadcast("noise", sigma, shape).reshape(power.shape)
+    sigma = as_positive_noise(noise, shape).reshape(power.shape)
     if not np.all(np.isfinite(sigma).any(axis=2)):
         raise ValueError("noise is infinite in all samples of a record; admissible are finite ones in each")
     return _Records(power, sigma, heights)
@@ -323,15 +326,6 @@ def _observed_records(
 def _heights_of(time: np.ndarray, cosine: np.ndarray | float) -> np.ndarray:
     """Return the heights, m, from which light of the first order arrives at the times, ns."""
     return -0.5 * SPEED_OF_LIGHT * np.asarray(time, float) * cosine
-
-
-def _broadcast(field: str, values: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    try:
-        return np.broadcast_to(values, shape)
-    except ValueError:
-        raise ValueError(
-            f"{field} has shape {values.shape}, which does not broadcast to that of records, {shape}"
-        ) from None
 
 
 # -- nodes -------------------------------------------------------------------------------------------------
