@@ -152,8 +152,8 @@ def cramer_rao(problem: Problem, *, key: PRNGKeyArray) -> CramerRao:
     recorder_start = recorder_model.start(evaluation.reflectance, record)
     # The simulation's own noise is no part of the bound.
     noise = recorder_model.sample_noise(observed, evaluation, recorder_start, with_simulation=False)
-    recorded = recorder_model(evaluation.reflectance, evaluation.jacobian, recorder_start)
-    jacobian = noise.whiten(recorded.jacobian[observed.is_fitted])
+    _, jacobian = recorder_model(evaluation.reflectance, evaluation.jacobian, recorder_start)
+    jacobian = noise.whiten(jacobian[observed.is_fitted])
     prior_jacobian = priors(np.append(start, recorder_start))[1]
     precision = prior_jacobian.T @ prior_jacobian
     low, high = flat_bounds(unknowns)

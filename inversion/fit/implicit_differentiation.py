@@ -120,7 +120,8 @@ def estimate_derivatives(
     is_fitted, noise, evaluation = observed.is_fitted, fit.details.noise, fit.details.evaluation
     values, difference = fit.summary.values, fit.details.difference
     recorder_values = values[values.size - recorder.count :]
-    jacobian = recorder(evaluation.reflectance, evaluation.jacobian, recorder_values).jacobian[is_fitted]
+    _, jacobian = recorder(evaluation.reflectance, evaluation.jacobian, recorder_values)
+    jacobian = jacobian[is_fitted]
     priors = PriorResiduals(unknowns)
     priors.set_strengths(fit.summary.strength)
     prior_residual, prior_jacobian = priors(values)

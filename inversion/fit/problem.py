@@ -30,10 +30,10 @@ from inversion.fit.data import (
 )
 from inversion.fit.planning import checked_plan, plan_without_record, size_arguments
 from inversion.fit.recorder_model import RecorderModel, check_names
-from inversion.fit.unknowns import BoundUnknown, Setter, Unknown, bind_unknowns, with_start
-from inversion.receiver.recorder import Recorder
+from inversion.fit.unknowns import BoundUnknown, Unknown, bind_unknowns, unknown_outside_scene, with_start
+from inversion.receiver.recorder import Recorder, bound_pair
 from jaxlidar import Lidar, Plan, Scene, Waveform
-from jaxlidar.extend import as_numpy, check_kind, check_kinds, check_range
+from jaxlidar.extend import as_numpy, check_kind, check_kinds
 
 
 @dataclasses.dataclass(frozen=True)
@@ -326,17 +326,9 @@ def _of_record(objects: Sequence[Any], i: int) -> Any:
 
 def scale_unknown(bounds: Any, unknowns: Sequence[BoundUnknown]) -> BoundUnknown:
     """Return the unknown "scale" of an uncalibrated receiver. **Raises:** ValueError for bad bounds."""
-    try:
-        low, high = (float(b) for b in bounds)
-    except (TypeError, ValueError):
-        raise ValueError(f"scale = {bounds!r} is not a pair (low, high)") from None
-    check_range("scale", [low, high], 0.0)
-    if not low < high:
-        raise ValueError(f"scale = {bounds!r} is not low < high")
+    pair = bound_pair("scale", bounds, 0.0)
     # Results are keyed by name.
     if any(u.name == "scale" for u in unknowns):
         raise ValueError("name = 'scale' is taken by the scale; the unknown needs another one")
     # The first simulation gives it a better start (`RecorderModel.fit_linear`).
-    start = jnp.asarray(0.5 * (low + high))
-    outside_scene = Setter(None, None, "optical")
-    return BoundUnknown("scale", outside_scene, start, np.asarray(low), np.asarray(high), None)
+    return unknown_outside_scene("scale", pair)

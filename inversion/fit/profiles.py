@@ -16,16 +16,15 @@ number of degrees of freedom for signal: how many numbers the data determine.
 over diagonal: Purser and Huang (1993), J. Appl. Meteorol. 32, 1211.
 """
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-import scipy
 from jaxtyping import Array, Float
 
 from jaxlidar import Plane, Scene, VoxelMap
-from jaxlidar.extend import as_array, check_kind, check_range, concrete
+from jaxlidar.extend import as_array, concrete
 
 
 def put_profile(scene: Scene, density: Float[Array, " layers"]) -> Scene:
@@ -138,73 +137,3 @@ class AveragingKernel(NamedTuple):
     matrix: Float[np.ndarray, "... layers layers"]
     degrees_of_freedom: Float[np.ndarray, "..."]
     resolution: Float[np.ndarray, "... layers"]
-
-
-class AbstractPosterior(eqx.Module):
-    """Normal posterior of the unknowns of a fit, or of each of many fits."""
-
-    values: eqx.AbstractVar[dict[str, Any]]
-    stderr: eqx.AbstractVar[dict[str, Any]]
-    robust_stderr: eqx.AbstractVar[dict[str, Any]]
-    averaging: eqx.AbstractVar[Any]
-    bounds: eqx.AbstractVar[dict[str, Any]]
-
-    def band(self, name: str, level: float = 0.95, *, robust: bool = False) -> tuple[np.ndarray, np.ndarray]:
-        """Credible band of an unknown, within its bounds: see `inversion.fit.profiles`.
-
-        **Arguments:**
-
-        - `name`: of the unknown.
-        - `level`: probability, in (0, 1). Default 0.95.
-        - `robust`: use `robust_stderr` in place of `stderr`. Default False.
-
-        **Returns:** (low, high), each of the shape of the values; the bounds for an infinite standard error.
-
-        **Raises:** ValueError for a name that the fit does not have, and a `level` outside (0, 1).
-        """
-        check_range("level", level, 0.0, 1.0, low_open=True, high_open=True)
-        check_kind("robust", robust, bool, "True or False")
-        self._rows_of(name)
-        values = np.asarray(self.values[name], float)
-        stderr = np.asarray((self.robust_stderr if robust else self.stderr)[name], float)
-        low, high = (np.broadcast_to(b, values.shape) for b in np.asarray(self.bounds[name], float))
-        is_determined = np.isfinite(stderr)
-        half_width = scipy.special.ndtri(0.5 + 0.5 * level) * np.where(is_determined, stderr, 0.0)
-        lower, upper = np.maximum(values - half_width, low), np.minimum(values + half_width, high)
-        return np.where(is_determined, lower, low), np.where(is_determined, upper, high)
-
-    def averaging_kernel(self, name: str, spacing: float = 1.0) -> AveragingKernel:
-        """Response of the estimate of a profile to the true profile, and its height resolution.
-
-        The other unknowns are fitted as well; strengths of smoothness priors are taken as known.
-
-        **Arguments:**
-
-        - `name`: of the unknown.
-        - `spacing`: distance between layers, positive, such as in m. Default 1: the resolution is in layers.
-
-        **Returns:** an `AveragingKernel`, of NumPy arrays.
-
-        **Raises:** ValueError for a name that the fit does not have, and a `spacing` that is not positive.
-        """
-        check_range("spacing", spacing, 0.0, low_open=True)
-        rows = self._rows_of(name)
-        matrix = np.asarray(self.averaging, float)[..., rows, rows]
-        diagonal = np.diagonal(matrix, axis1=-2, axis2=-1)
-        # The inner where keeps the division finite.
-        positive = np.where(diagonal > 0.0, diagonal, 1.0)
-        resolution = np.where(diagonal > 0.0, float(spacing) / positive, np.inf)
-        return AveragingKernel(matrix, np.sum(diagonal, axis=-1), resolution)
-
-    def _rows_of(self, name: str) -> slice:
-        """Return the rows of an unknown among the flattened ones. **Raises:** ValueError for another name."""
-        if name not in self.values:
-            raise ValueError(f"name = {name!r}; admissible are {', '.join(map(repr, self.values))}")
-        first = 0
-        for other_name, bounds in self.bounds.items():
-            # Bounds have the shape (2, ...).
-            size = int(np.size(bounds)) // 2
-            if other_name == name:
-                return slice(first, first + size)
-            first += size
-        raise AssertionError(name)

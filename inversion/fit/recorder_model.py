@@ -32,20 +32,13 @@ from inversion.fit.data import (
     shared_errors_of_samples,
 )
 from inversion.fit.model import Evaluation, batch_stderr
-from inversion.fit.unknowns import MARGIN, BoundUnknown, Setter, flat_start, with_start
+from inversion.fit.unknowns import MARGIN, BoundUnknown, flat_bounds, flat_start, unknown_outside_scene
 from inversion.receiver.recorder import DELAY_NAME, OFFSET_NAME, WIDTH_NAME, ReceiverResponse, Recorder
 from jaxlidar import Lidar
 from jaxlidar.extend import concrete
 
 # Returns of the scene below this fraction of the strongest one are rounding.
 _FAINT = 1e-6
-
-
-class RecordWithJacobian(NamedTuple):
-    """Modelled record, (wavelengths, bins), and its Jacobian, (wavelengths, bins, unknowns)."""
-
-    reflectance: np.ndarray
-    jacobian: np.ndarray
 
 
 class RecorderValues(NamedTuple):
@@ -102,13 +95,14 @@ class RecorderModel:
 
     def __call__(
         self, reflectance: np.ndarray, jacobian: np.ndarray, values: np.ndarray
-    ) -> RecordWithJacobian:
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Model the record of a simulated waveform.
 
         **Arguments:** `reflectance`: (wavelengths, bins). `jacobian`: (wavelengths, bins, n), with respect to
         the unknowns of the scene. `values`: of the recorder's unknowns.
 
-        **Returns:** the record, and its Jacobian with the columns of the recorder's unknowns appended.
+        **Returns:** the record, (wavelengths, bins), and its Jacobian with the columns of the recorder's
+        unknowns appended, (wavelengths, bins, unknowns).
         """
         by_name = self._split(values)
         scale, received = by_name.scale, self._receive(reflectance, by_name)
@@ -124,7 +118,7 @@ class RecorderModel:
         )
         if self.has_scale:
             columns.append(received[..., None])
-        return RecordWithJacobian(self.record(reflectance, values), np.concatenate(columns, axis=-1))
+        return self.record(reflectance, values), np.concatenate(columns, axis=-1)
 
     def record(self, reflectance: Any, values: Any) -> Any:
         """Model the record alone. JAX arrays may be traced and differentiated.
@@ -203,10 +197,7 @@ class RecorderModel:
         norm = np.linalg.norm(columns, axis=0)
         norm = np.where(norm > 0, norm, 1.0)
         fitted = np.linalg.lstsq(columns / norm, target, rcond=None)[0] / norm
-        low, high = (
-            np.concatenate([np.ravel(getattr(unknown, end)) for unknown in self.unknowns])
-            for end in ("low", "high")
-        )
+        low, high = flat_bounds(self.unknowns)
         margin = MARGIN * (high - low)
         return np.clip(np.append(values[: values.size - fitted.size], fitted), low + margin, high - margin)
 
@@ -252,19 +243,16 @@ def recorder_unknowns(recorder: Recorder) -> list[BoundUnknown]:
 
     The first simulation gives the offset a better start (`RecorderModel.fit_linear`).
     """
-    # They change no part of the scene.
-    outside_scene, unknowns = Setter(None, None, "optical"), []
     shapes = {
         WIDTH_NAME: (recorder.width, ()),
         DELAY_NAME: (recorder.delay, ()),
         OFFSET_NAME: (recorder.offset, () if recorder.interleaved == 1 else (recorder.interleaved,)),
     }
-    for name, (bounds, shape) in shapes.items():
-        if bounds is not None:
-            low, high = (np.full(shape, end, float) for end in bounds)
-            middle = jnp.asarray(0.5 * (low + high))
-            unknowns.append(with_start(BoundUnknown(name, outside_scene, middle, low, high, None), middle))
-    return unknowns
+    return [
+        unknown_outside_scene(name, bounds, shape)
+        for name, (bounds, shape) in shapes.items()
+        if bounds is not None
+    ]
 
 
 def check_names(recorder: Recorder | None, unknowns: Sequence[BoundUnknown]) -> None:

@@ -44,7 +44,7 @@ from inversion.fit.solver import (
     run_fits,
 )
 from inversion.fit.unknowns import BoundUnknown
-from jaxlidar import Lidar, Progress, Scene
+from jaxlidar import Progress
 from jaxlidar.extend import (
     Program,
     check_integer,
@@ -335,13 +335,11 @@ class LockstepModel:
         n_batches = [*(self._n_batches(requests[i]) for i in group), *[0] * n_idle]
         model = self.model
         values = jax.tree.map(lambda *a: jnp.stack(a), *(model.values(requests[i].values) for i in members))
-        inputs = dataclasses.replace(
-            model.inputs, lidar=_stacked(self.lidars, members), scene=_stacked(self.scenes, members)
-        )
-        # Static: another combination compiles another program.
-        has_axis = HasFootprintAxis(len(self.lidars) > 1, len(self.scenes) > 1)
+        stacked = {"lidar": self.lidars, "scene": self.scenes}
+        stacked = {name: _stacked(a, members) for name, a in stacked.items() if len(a) > 1}
+        keys, n_batches_of_members = jnp.stack(model.keys), jnp.array(n_batches)
         # Results of idle members are dropped.
-        arrays = _evaluate_in_lockstep(inputs, values, jnp.stack(model.keys), jnp.array(n_batches), has_axis)
+        arrays = _evaluate_in_lockstep(model.inputs, stacked, values, keys, n_batches_of_members)
         reflectance, columns, batches = (np.asarray(a, float) for a in arrays)
         return {
             i: Evaluation(
@@ -356,44 +354,30 @@ class LockstepModel:
 
 
 def _stacked(objects: list[Any], members: list[int]) -> Any:
-    """Return one object for all, or the members' objects with their arrays stacked."""
-    if len(objects) == 1:
-        return objects[0]
+    """Return the members' objects with their arrays stacked."""
     # Fields that are no arrays are equal (`inversion.fit.problem`).
     dynamic, static = zip(*(eqx.partition(objects[i], eqx.is_array) for i in members))
     return eqx.combine(jax.tree.map(lambda *a: jnp.stack(a), *dynamic), static[0])
 
 
-class HasFootprintAxis(NamedTuple):
-    """True for lidar and scene that have a leading axis of footprints, False if one serves all."""
-
-    lidar: bool
-    scene: bool
-
-
 @functools.partial(Program, one_core=True)
 def _evaluate_in_lockstep(
-    inputs: SimulationInputs, values: Any, keys: Array, n_batches: Array, has_axis: HasFootprintAxis
+    inputs: SimulationInputs, stacked: dict[str, Any], values: Any, keys: Array, n_batches: Array
 ) -> tuple[Array, Array, Array]:
-    """Map `evaluate_scene` over the members of a group."""
-    lidar, static_lidar = eqx.partition(inputs.lidar, eqx.is_array)
-    scene, static_scene = eqx.partition(inputs.scene, eqx.is_array)
+    """Map `evaluate_scene` over the members of a group.
 
-    def evaluate(lidar: Lidar, scene: Scene, values: Any, n_batches: Array) -> tuple[Array, Array, Array]:
-        lidar, scene = eqx.combine(lidar, static_lidar), eqx.combine(scene, static_scene)
-        member = dataclasses.replace(inputs, lidar=lidar, scene=scene)
-        return evaluate_scene(member, values, keys, n_batches)
+    `stacked`: fields of `inputs` that differ between members, with a leading axis.
+    """
+    stacked_arrays, static = eqx.partition(stacked, eqx.is_array)
 
+    def evaluate(member: tuple) -> tuple[Array, Array, Array]:
+        arrays, values, n_batches = member
+        own_inputs = dataclasses.replace(inputs, **eqx.combine(arrays, static))
+        return evaluate_scene(own_inputs, values, keys, n_batches)
+
+    members = stacked_arrays, values, n_batches
     # At first order there are no photons, and all members take equally long.
     if not inputs.plan.config.follows_higher_orders:
-        axes = (0 if has_axis.lidar else None, 0 if has_axis.scene else None, 0, 0)
-        return jax.vmap(evaluate, in_axes=axes)(lidar, scene, values, n_batches)
-
+        return jax.vmap(evaluate)(members)
     # Not vmap: a batched loop goes on until the photons of the slowest member have ended.
-    def evaluate_member(member: tuple) -> tuple[Array, Array, Array]:
-        member_lidar = member[0] if has_axis.lidar else lidar
-        member_scene = member[1] if has_axis.scene else scene
-        return evaluate(member_lidar, member_scene, *member[2:])
-
-    mapped = (lidar if has_axis.lidar else None, scene if has_axis.scene else None, values, n_batches)
-    return jax.lax.map(evaluate_member, mapped)
+    return jax.lax.map(evaluate, members)

@@ -156,9 +156,11 @@ class Iterate:
     def __init__(self, fit: "LeastSquaresFit", values: np.ndarray, evaluation: Evaluation):
         self.values, self.evaluation = values, evaluation
         self.recorder_values = self.values[fit.n_scene :]
-        recorded = fit.recorder_model(evaluation.reflectance, evaluation.jacobian, self.recorder_values)
-        self.difference = (recorded.reflectance - fit.observed.reflectance)[fit.is_fitted]
-        self.jacobian = recorded.jacobian[fit.is_fitted]
+        record, jacobian = fit.recorder_model(
+            evaluation.reflectance, evaluation.jacobian, self.recorder_values
+        )
+        self.difference = (record - fit.observed.reflectance)[fit.is_fitted]
+        self.jacobian = jacobian[fit.is_fitted]
         self.is_finite = bool(np.all(np.isfinite(self.difference)) and np.all(np.isfinite(self.jacobian)))
 
 

@@ -306,6 +306,15 @@ def _bind(
     return with_start(bound, start)
 
 
+def unknown_outside_scene(
+    name: str, bounds: tuple[float, float], shape: tuple[int, ...] = (), start: float | None = None
+) -> BoundUnknown:
+    """Return an unknown that changes no part of the scene; it starts from the middle of its bounds (None)."""
+    low, high = (np.full(shape, bound, float) for bound in bounds)
+    values = jnp.asarray(0.5 * (low + high) if start is None else np.full(shape, start))
+    return with_start(BoundUnknown(name, Setter(None, None, "optical"), values, low, high, None), values)
+
+
 def with_start(unknown: BoundUnknown, start: Array) -> BoundUnknown:
     """Return the unknown with another start, kept at `MARGIN` from its bounds.
 

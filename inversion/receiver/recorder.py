@@ -94,7 +94,7 @@ class Recorder(eqx.Module):
         for field, low in (("width", 0.0), ("delay", -np.inf), ("offset", -np.inf)):
             bounds = getattr(self, field)
             if bounds is not None:
-                _check_bounds(field, bounds, low)
+                bound_pair(field, bounds, low)
         check_integer("interleaved", self.interleaved)
         check_ranges(self)
         if self.interleaved > 1 and self.offset is None:
@@ -166,11 +166,13 @@ class ReceiverResponse:
         return numpy.fft.irfft(transformed * spectrum, self.size)[..., : self.bins]
 
 
-def _check_bounds(field: str, bounds: Any, least: float) -> None:
-    check_range(field, bounds, least)
+def bound_pair(field: str, bounds: Any, least: float = -np.inf) -> BoundPair:
+    """Return bounds as numbers. **Raises:** ValueError unless they are a pair low < high, from `least` on."""
     try:
         low, high = (float(b) for b in bounds)
     except (TypeError, ValueError):
         raise ValueError(f"{field} = {bounds!r} is not a pair (low, high)") from None
+    check_range(field, [low, high], least)
     if not low < high:
         raise ValueError(f"{field} = {bounds!r} is not low < high")
+    return low, high

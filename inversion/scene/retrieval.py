@@ -45,16 +45,14 @@ import numpy as np
 import scipy
 from jaxtyping import ArrayLike, Bool, Float, Int, PRNGKeyArray
 
-from inversion.fit.data import as_noise, as_sample_times, with_fixed_window
+from inversion.fit.data import as_positive_noise, as_sample_times, with_fixed_window
 from inversion.fit.planning import N_BATCHES, plan_for_bounds
 from inversion.fit.unknowns import (
     BoundUnknown,
-    Setter,
     Unknown,
     bind_unknowns,
     flat_bounds,
     flat_start,
-    with_start,
 )
 from inversion.scene.map_priors import MapPriors
 from inversion.scene.scene_retrieval import SceneRetrieval, make_scene_retrieval
@@ -319,10 +317,7 @@ def _observed_records(waveforms: Any, time: Any, noise: Any, survey: Survey) -> 
         raise ValueError(
             f"waveforms has the shape {observed.shape}; admissible is (shots, wavelengths, samples) = {shape}"
         )
-    sigma = as_noise(noise, shape)
-    # Written so that NaN is refused.
-    if not np.all(sigma > 0):
-        raise ValueError(f"noise = {sigma[~(sigma > 0)].flat[0]:g} is outside the admissible range (0, inf]")
+    sigma = as_positive_noise(noise, shape)
     is_used = np.isfinite(sigma)
     if not np.any(is_used):
         raise ValueError("noise is infinite throughout, which leaves no sample to fit")
@@ -344,31 +339,16 @@ def _shot_groups(
     group = numbers.astype(int)
     n_groups = int(group.max()) + 1
 
-    def unknown(name: str, bounds: Any, start: float, **limits: Any) -> BoundUnknown | None:
+    def unknown(name: str, bounds: Any, start: float, least: float) -> BoundUnknown | None:
         if bounds is None:
             return None
-        try:
-            low, high = (float(b) for b in bounds)
-        except (TypeError, ValueError):
-            raise ValueError(f"{name} = {bounds!r} is not a pair (low, high)") from None
-        check_range(name, [low, high], **limits)
-        if not low < high:
-            raise ValueError(f"{name} = {bounds!r} is not low < high")
+        pair = bound_pair(name, bounds, least)
         if name in [u.name for u in unknowns]:
             raise ValueError(f"name = {name!r} is given to an unknown; with {name} = ... it is that of shots")
         # No gain and no offset is the natural start, where the bounds admit it.
-        values = np.full(n_groups, float(np.clip(start, low, high)))
-        bound = BoundUnknown(
-            name,
-            Setter(None, None, "optical"),
-            jax.numpy.asarray(values),
-            np.full(n_groups, low),
-            np.full(n_groups, high),
-            None,
-        )
-        return with_start(bound, bound.start)
+        return unknown_outside_scene(name, pair, (n_groups,), float(np.clip(start, *pair)))
 
-    return ShotGroups(group, unknown("gain", gain, 1.0, low=0.0), unknown("offset", offset, 0.0))
+    return ShotGroups(group, unknown("gain", gain, 1.0, 0.0), unknown("offset", offset, 0.0, -np.inf))
 
 
 def _kernel_places(

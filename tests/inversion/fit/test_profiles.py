@@ -5,7 +5,6 @@ a case that it solves exactly.
 """
 
 import dataclasses
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -17,13 +16,12 @@ import inversion
 import jaxlidar as jl
 from inversion import Smooth, Unknown
 from inversion.fit.data import ObservedWaveform
-from inversion.fit.fit_summary import FitSummary
 from inversion.fit.model import Evaluation
 from inversion.fit.prior_residuals import PriorResiduals
-from inversion.fit.profiles import AbstractPosterior
 from inversion.fit.recorder_model import RecorderModel
+from inversion.fit.result import retrievals_of
 from inversion.fit.solver import LeastSquaresFit, SolverSettings
-from inversion.fit.unknowns import BoundUnknown, Setter, bounds_by_name, split_by_name
+from inversion.fit.unknowns import BoundUnknown, Setter
 from tests.helpers import BY_PRECISION, ask, run_fit
 
 LAYERS, SAMPLES, STRENGTH = 12, 40, 0.3
@@ -47,18 +45,6 @@ def instrument():
     return np.column_stack([blur, np.ones(SAMPLES)])
 
 
-class FittedProfile(AbstractPosterior):
-    """The posterior of a fit of the linear instrument, and the summary of the fit."""
-
-    values: dict[str, Any]
-    stderr: dict[str, Any]
-    robust_stderr: dict[str, Any]
-    averaging: np.ndarray
-    bounds: dict[str, Any]
-    prior_share: dict[str, Any]
-    summary: FitSummary
-
-
 def fitted(observed, smooth, **bounds):
     """Fit a record with noise of one."""
     matrix, unknowns = instrument(), unknowns_with(smooth, **bounds)
@@ -69,12 +55,7 @@ def fitted(observed, smooth, **bounds):
     def simulate(request):
         return Evaluation((matrix @ request.values)[None], matrix[None], None, None)
 
-    result = run_fit(fit.run(), simulate).summary
-    vectors = ("values", "stderr", "robust_stderr", "prior_share")
-    by_name = {field: split_by_name(getattr(result, field), unknowns) for field in vectors}
-    return FittedProfile(
-        **by_name, averaging=result.averaging, bounds=bounds_by_name(unknowns), summary=result
-    )
+    return retrievals_of([run_fit(fit.run(), simulate).summary], unknowns)[0]
 
 
 def matern(scale):
@@ -105,9 +86,9 @@ def test_the_fit_is_the_posterior_mean_with_its_covariance():
     centre = np.append(np.full(LAYERS, CENTRE), 0.0)
     mean, covariance = centre + gain @ (y - matrix @ centre), prior - gain @ matrix @ prior
     fit = fitted(y, SMOOTH)
-    assert fit.summary.converged, fit.summary.status
+    assert fit.converged, fit.status
     np.testing.assert_allclose(fit.values["x"], mean[:-1], atol=2e-3)
-    np.testing.assert_allclose(fit.summary.covariance, covariance, rtol=1e-3, atol=1e-4)
+    np.testing.assert_allclose(fit.covariance, covariance, rtol=1e-3, atol=1e-4)
     np.testing.assert_allclose(fit.averaging, gain @ matrix, atol=1e-4)
     prior_share = np.clip(1.0 - np.diag(gain @ matrix)[:-1], 0.0, 1.0)
     np.testing.assert_allclose(fit.prior_share["x"], prior_share, atol=1e-4)
@@ -134,8 +115,8 @@ def test_the_strength_is_that_of_the_largest_evidence():
         priors.set_strengths(priors.maximise_evidence(values, matrix @ values - y, matrix))
     np.testing.assert_allclose(priors.strengths, best, rtol=0.02)
     fit = fitted(y, Smooth(3.0))
-    assert fit.summary.converged
-    np.testing.assert_allclose(fit.summary.strength, best, rtol=0.12)
+    assert fit.converged
+    np.testing.assert_allclose(fit.strength["x"], best, rtol=0.12)
     # The evidence of other strengths is lower by more than the grid's steps.
     assert deviance(3.0 * best) > deviance(best) + 0.5
     assert deviance(best / 3.0) > deviance(best) + 0.5
@@ -209,8 +190,8 @@ def test_layers_at_their_bound_are_those_of_bounded_least_squares():
     exact = optimize.lsq_linear(rows, right_hand_side, bounds, method="bvls", tol=1e-12).x
     assert np.sum(exact[:-1] < 1e-9) >= 2
     fit = fitted(y, smooth, low=0.0)
-    assert fit.summary.converged
-    assert fit.summary.steps < 8
+    assert fit.converged
+    assert fit.steps < 8
     np.testing.assert_allclose(fit.values["x"], exact[:-1], atol=5e-3)
     low, high = fit.band("x", 0.95)
     assert np.all((low >= 0.0) & (low <= fit.values["x"]) & (fit.values["x"] < high))

@@ -148,17 +148,16 @@ def test_derivatives_are_those_of_differences():
     # Width, delay, three offsets and scale.
     values = np.array([1.3, 0.7, 0.1, -0.2, 0.05, 2.0])
     total, scene_jacobian = random.normal(size=(2, 50)), random.normal(size=(2, 50, 1))
-    jacobian = model(total, scene_jacobian, values).jacobian
+    _, jacobian = model(total, scene_jacobian, values)
     step = 1e-5
     for i in range(values.size):
         plus, minus = (
-            model(total, scene_jacobian, values + sign * step * np.eye(values.size)[i]).reflectance
+            model(total, scene_jacobian, values + sign * step * np.eye(values.size)[i])[0]
             for sign in (1.0, -1.0)
         )
         np.testing.assert_allclose(jacobian[..., 1 + i], (plus - minus) / (2.0 * step), atol=1e-8)
     plus, minus = (
-        model(total + sign * step * scene_jacobian[..., 0], scene_jacobian, values).reflectance
-        for sign in (1.0, -1.0)
+        model(total + sign * step * scene_jacobian[..., 0], scene_jacobian, values)[0] for sign in (1.0, -1.0)
     )
     np.testing.assert_allclose(jacobian[..., 0], (plus - minus) / (2.0 * step), atol=1e-8)
 
@@ -201,7 +200,7 @@ def test_light_smoothed_out_of_the_record_does_not_come_back():
     total = np.zeros((1, 40))
     total[0, -1] = 1.0
     model = RecorderModel(Recorder(width=(0.1, 9.0)), [], jl.Lidar(), 40)
-    assert np.all(np.abs(model(total, np.zeros((1, 40, 0)), np.array([3.0])).reflectance[0, :20]) < 1e-6)
+    assert np.all(np.abs(model.record(total, np.array([3.0]))[0, :20]) < 1e-6)
 
 
 @pytest.mark.slow
