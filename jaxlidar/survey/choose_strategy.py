@@ -130,12 +130,8 @@ def _columns_of_footprint(plan: Plan, survey: Survey, scene: Scene) -> float:
     if survey.has_sensor_position:
         # The radius is that 1 m ahead of the sensor: the widest footprint is that of the last return.
         radius *= 0.5 * SPEED_OF_LIGHT * plan.scope.last_return / AIM_DISTANCE
-    return _cells_across(2.0 * radius, edge) ** 2
-
-
-def _cells_across(width: float, edge: float) -> float:
-    """Return about how many cells of an edge a width meets, in the mean over positions."""
-    return 1.0 + width / edge
+    # In the mean over positions.
+    return (1.0 + 2.0 * radius / edge) ** 2
 
 
 def _rays_of_batch(plan: Plan, columns: float, rtol: float) -> int:

@@ -19,6 +19,7 @@ from jaxlidar.scenes.shapes import AbstractShape, Plane
 from jaxlidar.scenes.terrain import Terrain
 from jaxlidar.sensors.lidar import AIM_DISTANCE
 from jaxlidar.sensors.survey import Survey
+from jaxlidar.trace.first.footprint import GOLDEN
 
 # Cosines of incidence below this count as along the ground.
 _LEAST_COSINE = 1e-6
@@ -228,11 +229,23 @@ def _meets_box(survey: Survey, box: Float[np.ndarray, "2 3"], margin: float) -> 
     return is_box & (np.maximum(enter, 0.0) <= leave)
 
 
+def disc_of_footprint(survey: Survey, count: int) -> Float[np.ndarray, "count 2"]:
+    """Return points of equal energy in a footprint of radius one, a Fibonacci lattice.
+
+    r follows from the energy within r, 1 - exp(-2 r^2) of a Gaussian and r^2 of a top hat, and angles advance
+    by the golden angle.
+    """
+    enclosed = (np.arange(count) + 0.5) / count
+    gaussian = survey.lidar.profile == "gaussian"
+    radius = np.sqrt(-0.5 * np.log1p(-enclosed) if gaussian else enclosed)
+    angle = 2.0 * np.pi * GOLDEN * np.arange(count)
+    return radius[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+
+
 def off_map(survey: Survey, scene: Scene) -> Float[np.ndarray, " shots"]:
     """Return the fraction of each footprint's light outside the voxel map, at the map's top or its bottom.
 
-    1. Points of equal energy in a footprint of radius one: r follows from the energy within r, 1 - exp(-2
-       r^2) of a Gaussian and r^2 of a top hat, and angles advance by the golden angle (a Fibonacci lattice).
+    1. Points of equal energy in a footprint of radius one.
     2. Stretched to the footprint on a level plane.
     3. Moved along the axis to the heights of the map's top and bottom.
 
@@ -243,11 +256,8 @@ def off_map(survey: Survey, scene: Scene) -> Float[np.ndarray, " shots"]:
     if canopy is None or canopy.sides == "periodic" or survey.has_sensor_position:
         return np.zeros(len(survey))
     low, high = (np.asarray(a, float) for a in (canopy.voxels.origin, canopy.voxels.top))
-    enclosed_energy = (np.arange(_POINTS) + 0.5) / _POINTS
-    gaussian = survey.lidar.profile == "gaussian"
-    radius = np.sqrt(-0.5 * np.log1p(-enclosed_energy) if gaussian else enclosed_energy)
-    angle = np.pi * (np.sqrt(5.0) - 1.0) * np.arange(_POINTS)
-    disc = np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=-1)
+    disc = disc_of_footprint(survey, _POINTS)
+    radius = np.linalg.norm(disc, axis=1)
     fractions = np.zeros(len(survey))
     # A disc around the longest side of the stretched footprint.
     direction = survey.direction

@@ -183,12 +183,15 @@ def gaussian_decomposition(
         raise ValueError(f"noise has the shape {np.shape(noise)}; admissible is () or {y_shape}")
     if (width is None) == (pulse is None):
         raise ValueError("width and pulse: admissible is one of them")
-    _check_noise(noise)
+    sigma = concrete(noise)
+    # It may be infinite.
+    finite_sigma = noise if sigma is None else np.where(np.isposinf(sigma), 1.0, sigma)
+    check_range("noise", finite_sigma, 0.0, low_open=True)
     check_range("pulse_error", pulse_error, 0.0)
     times = even_axis("time", time)
     y, magnitude = divide_by_largest(power, "power", noise)
-    sigma = _over_magnitude(noise, magnitude)
-    padded, weight = _padded_to(record_bucket(bins), y, sigma)
+    relative_noise = divide(noise, magnitude if np.ndim(magnitude) == 0 else magnitude[..., None], "noise")
+    padded, weight = _padded_to(record_bucket(bins), y, relative_noise)
     arrays = {"power": padded, "weight": weight, "step": jnp.asarray(times.step, y.dtype)}
     if pulse is None:
         assert width is not None
@@ -203,19 +206,6 @@ def gaussian_decomposition(
             # For each record the one or the other: a width that does not pay for itself is zero.
             echoes = _better(_compiled_decomposition("broadened", max_echoes)(**arrays), echoes)
     return _in_units(echoes, times.first, jnp.asarray(magnitude, y.dtype), bins)
-
-
-def _check_noise(noise: ArrayLike) -> None:
-    """Refuse noise that is not above 0; it may be infinite. **Raises:** ValueError."""
-    values = concrete(noise)
-    check_range(
-        "noise", noise if values is None else np.where(np.isposinf(values), 1.0, values), 0.0, low_open=True
-    )
-
-
-def _over_magnitude(noise: ArrayLike, magnitude: Array | np.ndarray) -> Array:
-    """Noise, one number or one for each sample, over the magnitude of its record."""
-    return divide(noise, magnitude if np.ndim(magnitude) == 0 else magnitude[..., None], "noise")
 
 
 @partial(jax.jit, static_argnames="size")

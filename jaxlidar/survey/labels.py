@@ -31,7 +31,7 @@ from jaxlidar.scenes.mesh_surface import MeshSurface, MeshTree, build_mesh_tree
 from jaxlidar.scenes.scene import Scene
 from jaxlidar.scenes.shapes import AbstractShape
 from jaxlidar.sensors.survey import Survey
-from jaxlidar.trace.first.footprint import GOLDEN
+from jaxlidar.survey.coverage import disc_of_footprint
 
 # Rays of a shot in the first round, and in the second one where returns have none; rays of a block.
 _RAYS, _BLOCK = (24, 600), 1 << 16
@@ -221,13 +221,10 @@ class _FirstHits:
     @staticmethod
     def _directions(part: Survey, n_rays: int) -> Float[np.ndarray, "shots rays 3"]:
         """Return unit vectors of rays of equal energy over the footprints of shots."""
-        enclosed = (np.arange(n_rays) + 0.5) / n_rays
-        radius = np.sqrt(-0.5 * np.log1p(-enclosed) if part.lidar.profile == "gaussian" else enclosed)
-        turn = 2.0 * np.pi * GOLDEN * np.arange(n_rays)
+        x, y = disc_of_footprint(part, n_rays).T[..., None]
         reach = (part.footprint_radius / part.slant_range)[:, None, None]
         axis, (first, second) = part.direction, part.footprint_axes
-        disc = np.cos(turn)[:, None] * first[:, None] + np.sin(turn)[:, None] * second[:, None]
-        rays = axis[:, None] + reach * radius[:, None] * disc
+        rays = axis[:, None] + reach * (x * first[:, None] + y * second[:, None])
         return rays / np.linalg.norm(rays, axis=2, keepdims=True)
 
 

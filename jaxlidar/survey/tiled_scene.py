@@ -56,15 +56,16 @@ class SceneTile(NamedTuple):
 class TileOptions(NamedTuple):
     """Arguments of `simulate_many` for all tiles, and what the results of all tiles have in common.
 
-    `window`: times of the first and the last sample, ns. `materials`, `surfaces`: names, of all parts.
+    `window`: times of the first and the last sample, ns; None: those that each part needs. `materials`,
+    `surfaces`: names, of all parts.
     """
 
     rtol: float | None
-    orders: int
+    orders: int | None
     shared: bool | None
-    window: tuple[float, float]
     truth: bool
     kept_names: tuple[str, ...]
+    window: tuple[float, float] | None = None
     materials: tuple[str, ...] = ()
     surfaces: tuple[str, ...] = ()
 
@@ -155,20 +156,19 @@ class TiledSceneStrategy(AbstractStrategy):
                 "survey: its shots are placed by their sensors; admissible over SceneParts, which "
                 "need to know where beams go, are shots with an altitude"
             )
-        starts, ends, longest_paths, orders = [], [], [], []
-        for tile in tiles_of(survey, scene):
-            plan = _strategy_of(survey, scene, tile, rtol, max_orders, shared, None, kept_names).setup.plan
-            starts.append(plan.sample_start)
-            ends.append(plan.sample_start + plan.sample_interval * (plan.n_samples - 1))
-            longest_paths.append(float(plan.limits.max_path))
-            orders.append(plan.orders)
-        options = TileOptions(rtol, max(orders), shared, (min(starts), max(ends)), truth, kept_names)
+        options = TileOptions(rtol, max_orders, shared, truth, kept_names)
+        tiles = tiles_of(survey, scene)
+        plans = [_strategy_of_tile(survey, scene, tile, options).setup.plan for tile in tiles]
+        ends = [plan.sample_start + plan.sample_interval * (plan.n_samples - 1) for plan in plans]
+        orders, start = max(plan.orders for plan in plans), min(plan.sample_start for plan in plans)
+        options = options._replace(orders=orders, window=(start, max(ends)))
 
         lossless = 0.0
-        if options.orders > 1:
+        if orders > 1:
             # A part's record may end before that of all: paths may then be longer by as much.
-            longer = max(options.window[1] - end for end in ends) * SPEED_OF_LIGHT
-            lossless = lossless_margin(survey, max(longest_paths) + longer, scene.z[1])
+            longest = max(float(plan.limits.max_path) for plan in plans)
+            longest += (max(ends) - min(ends)) * SPEED_OF_LIGHT
+            lossless = lossless_margin(survey, longest, scene.z[1])
         margin = lossless if scene.margin is None else float(scene.margin)
 
         tiles = tiles_of(survey, scene, margin)
@@ -234,35 +234,25 @@ class TiledSceneStrategy(AbstractStrategy):
         }
 
 
-def _strategy_of(
-    survey: Survey,
-    scene: SceneParts,
-    tile: SceneTile,
-    rtol: float | None,
-    orders: int | None,
-    shared: bool | None,
-    window: tuple[float, float] | None,
-    kept_names: tuple[str, ...],
+def _strategy_of_tile(
+    survey: Survey, scene: SceneParts, tile: SceneTile, options: TileOptions
 ) -> AbstractStrategy:
     """Return the strategy of the shots of a tile. **Raises:** as `simulate_many`, with the part's corners."""
     scene_part = scene.between(tile.low, tile.high)
     try:
         check_kinds(survey.lidar, scene_part)
         return choose_strategy(
-            survey.subset(tile.shots), scene_part, rtol, orders, shared, window, kept_names
+            survey.subset(tile.shots),
+            scene_part,
+            options.rtol,
+            options.orders,
+            options.shared,
+            options.window,
+            options.kept_names,
         )
     except ValueError as error:
         corners = f"part({tile.low.tolist()}, {tile.high.tolist()})"
         raise ValueError(f"{corners}, shots {tile.shots[:5].tolist()}: {error}") from error
-
-
-def _strategy_of_tile(
-    survey: Survey, scene: SceneParts, tile: SceneTile, options: TileOptions
-) -> AbstractStrategy:
-    """Return the strategy of the shots of a tile, with the window and the orders of all tiles."""
-    return _strategy_of(
-        survey, scene, tile, options.rtol, options.orders, options.shared, options.window, options.kept_names
-    )
 
 
 def _in_order_of_names(
