@@ -376,14 +376,10 @@ def _apply_optics(
     """Return the reflectance of a response, and its derivatives by the optical unknowns."""
     flat, setup_at = inputs.as_function_of("optical", values)
 
-    def reflectance(flat: Array) -> Array:
-        return total_reflectance(response, setup_at(flat))
+    def reflectance(flat: Array) -> tuple[Array, None]:
+        return total_reflectance(response, setup_at(flat)), None
 
-    if not flat.size:
-        value = reflectance(flat)
-        return value, jnp.zeros((0, *value.shape), value.dtype)
-    push = jax.vmap(lambda t: jax.jvp(reflectance, (flat,), (t,)), out_axes=(None, 0))
-    return push(jnp.eye(flat.size, dtype=flat.dtype))
+    return _value_and_tangents(reflectance, flat, flat.size)[:2]
 
 
 @Program

@@ -216,12 +216,8 @@ class Retrieval(eqx.Module):
 
         len(self)
         stored = datasets_of(self)["/"]
-        columns: dict[str, Any] = {}
-        for field in ("values", "stderr", "robust_stderr", "prior_share", "at_bound"):
-            suffix = "" if field == "values" else f" {field.replace('_', ' ')}"
-            for name, variable in variables_by_item(stored, field).items():
-                axes = {axis: f"{name} {i}" for i, axis in enumerate(stored[variable].dims[1:])}
-                columns[f"{name}{suffix}"] = stored[variable].rename(axes)
+        fields = ("values", "stderr", "robust_stderr", "prior_share", "at_bound")
+        columns = columns_of_unknowns(stored, fields, first_axis=1)
         for name in ("reduced_chi2", "second_minimum", "independent_samples", "converged", "steps"):
             columns[name] = stored[name]
         columns["status"] = ("footprint", np.array(self.status, dtype=object))
@@ -248,6 +244,20 @@ class Retrieval(eqx.Module):
         from jaxlidar.plot.html import fit_html
 
         return fit_html(str(self), self.waveform, self.residuals)
+
+
+def columns_of_unknowns(stored: Any, fields: Sequence[str], first_axis: int = 0) -> dict[str, Any]:
+    """Return variables of a result's dataset by name of unknown and field, with axes of their own.
+
+    `first_axis`: number of axes that unknowns share, such as that of the footprints.
+    """
+    columns = {}
+    for field in fields:
+        suffix = "" if field == "values" else f" {field.replace('_', ' ')}"
+        for name, variable in variables_by_item(stored, field).items():
+            axes = {axis: f"{name} {i}" for i, axis in enumerate(stored[variable].dims[first_axis:])}
+            columns[f"{name}{suffix}"] = stored[variable].rename(axes)
+    return columns
 
 
 def retrieval_of(

@@ -220,8 +220,7 @@ def _statistics(name: str, group: str, pair: ComparedColumn, sigmas: float) -> C
         return ComparisonStatistics(name, group, 0, *[float("nan")] * 6)
     rank = np.nan
     if difference.size >= _MIN_RANKED and np.ptp(pair.estimate) > 0 and np.ptp(pair.reference) > 0:
-        ranks = scipy.stats.rankdata(pair.estimate), scipy.stats.rankdata(pair.reference)
-        rank = float(np.corrcoef(*ranks)[0, 1])
+        rank = scipy.stats.spearmanr(pair.estimate, pair.reference).statistic
     has_error = np.isfinite(pair.stderr)
     is_covered = np.abs(difference) <= sigmas * pair.stderr
     return ComparisonStatistics(

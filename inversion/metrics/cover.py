@@ -21,6 +21,7 @@ All functions are differentiable.
 """
 
 from collections.abc import Sequence
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -162,6 +163,13 @@ def _split_record(
     return _SplitRecord(ground_height, top, bottom, ground_energy, canopy_energy, total, lags)
 
 
+def _energy_between(step, power, n_samples, low, high=jnp.inf):
+    """Energy of a padded record between two heights, with each sample spread evenly over its step."""
+    top = -step * jnp.arange(power.size, dtype=power.dtype) + 0.5 * step
+    fraction = jnp.clip((top - low) / step, 0.0, 1.0) - jnp.clip((top - high) / step, 0.0, 1.0)
+    return jnp.sum(jnp.where(jnp.arange(power.size) < n_samples, power * fraction, 0.0))
+
+
 @over_shots(step=0, power=1, n_samples=0, pulse=1, ground=0, top=0, bottom=0)
 def _split_energy(step, power, n_samples, pulse, ground, top, bottom):
     """Energy of the ground, at most that of the signal, and energy of the signal, of one padded record.
@@ -170,14 +178,7 @@ def _split_energy(step, power, n_samples, pulse, ground, top, bottom):
     2. Energy below the mode of the ground's echo, which lies `mode` samples after its time zero.
     3. Fraction of the pulse's energy after its mode, each sample spread evenly over its step.
     """
-    height = -step * jnp.arange(power.size, dtype=power.dtype)
-    is_recorded = jnp.arange(power.size) < n_samples
-
-    def above(level):
-        """Energy from above a height, with each sample spread evenly over its step."""
-        fraction = jnp.clip((height + 0.5 * step - level) / step, 0.0, 1.0)
-        return jnp.sum(jnp.where(is_recorded, power * fraction, 0.0))
-
+    above = partial(_energy_between, step, power, n_samples)
     signal_energy = above(bottom) - above(top)
     # The mode of the smoothed pulse, as `find_ground` reads the smoothed record.
     mode = smooth_pulse(pulse).mode
@@ -378,15 +379,9 @@ def _canopy_energy_above(step, power, n_samples, pulse, ground, ground_energy, t
 
         E_canopy(z) = E(z, top) - E_ground / 2 * E(bottom, m - r) / E(bottom, m),    r = z - m.
     """
-    height = -step * jnp.arange(power.size, dtype=power.dtype)
-    is_recorded = jnp.arange(power.size) < n_samples
     mode = ground - smooth_pulse(pulse).mode * step
 
-    def between(low, high):
-        fraction = jnp.clip((height + 0.5 * step - low) / step, 0.0, 1.0)
-        fraction = fraction - jnp.clip((height + 0.5 * step - high) / step, 0.0, 1.0)
-        return jnp.sum(jnp.where(is_recorded, power * fraction, 0.0))
-
+    between = partial(_energy_between, step, power, n_samples)
     lower_half = jnp.maximum(between(bottom, mode), _LEAST_HALF)
 
     def canopy_above(level):

@@ -53,6 +53,7 @@ from inversion.metrics.gedi import (
 )
 from inversion.metrics.gedi_fit import CANOPY, ESTIMATES, LAYER_ESTIMATES, fit_gedi_shots
 from inversion.metrics.heights import find_ground, signal_ends
+from inversion.metrics.records import SMOOTHING
 from inversion.scene.layered_canopy import LAYERS, REFLECTANCE_RATIO
 from jaxlidar import Progress
 from jaxlidar.extend import (
@@ -83,8 +84,6 @@ _CORRELATION_SUM = 2.0 * np.sqrt(np.pi) * RECEIVER_SMOOTHING
 # Fewest samples above the signal from which noise is estimated, and their distance from it in m. Where there
 # are fewer it is this fraction of the product's, which is that before smoothing.
 _MIN_QUIET, _QUIET_DISTANCE, _SMOOTHED_FRACTION = 50, 5.0, 0.41
-# Smoothing that finds the ground over that of the Gaussian of the pulse's peak and area: see `records.py`.
-_SMOOTHING = 0.83
 # Reproducibility of the mode of flat ground in m, and the fraction of the excess width of its echo by which
 # slopes and low plants move it.
 _MODE_ERROR, _EXCESS_FRACTION = 0.02, 0.015
@@ -209,7 +208,7 @@ def gedi_table(
     start_time = time.perf_counter()
     rows = _rows_of(shots)
     refusals = [_refusal(row) for row in rows]
-    verdicts = [_verdict_before(row, refusal) for row, refusal in zip(rows, refusals)]
+    verdicts = [judge_shot(row) if e is None else Verdict("bad", (e,)) for row, e in zip(rows, refusals)]
     # Shots whose records can be computed; the others keep their rows of NaN.
     usable = np.array([i for i, refusal in enumerate(refusals) if refusal is None], int)
     padded_size = record_bucket(max((np.size(rows[i].waveform) for i in usable), default=1))
@@ -275,11 +274,6 @@ def _refusal(shot: Any) -> str | None:
     except (AttributeError, TypeError, ValueError) as error:
         return str(error)
     return None
-
-
-def _verdict_before(row: Any, refusal: str | None) -> Verdict:
-    """Return the verdict on a record."""
-    return judge_shot(row) if refusal is None else Verdict("bad", (refusal,))
 
 
 def _verdict_after(row: Any, verdict: Verdict, estimates: dict[str, np.ndarray], i: int) -> Verdict:
@@ -390,7 +384,7 @@ def _quiet_noise(
 
 def _smoothing_width(pulse: np.ndarray) -> np.ndarray:
     """Return the standard deviation in samples of the Gaussian that smooths the records, (shots,)."""
-    return _SMOOTHING * pulse.sum(axis=1) / (np.sqrt(2.0 * np.pi) * pulse.max(axis=1))
+    return SMOOTHING * np.sqrt(_pulse_variance(pulse))
 
 
 def _ground_stderr(

@@ -639,16 +639,10 @@ def _smoothed(height: np.ndarray, weight: np.ndarray, step: float) -> np.ndarray
     """Smooth weighted heights by the Whittaker filter: second differences are penalised."""
     if height.size < 3:
         return height
-    # The matrix W + p D'D of weights W and second differences D has five diagonals.
     penalty = (_SMOOTHING_LENGTH / step) ** 4 / 10.0
-    stencil = (1.0, -2.0, 1.0)
-    bands = np.zeros((5, height.size))
-    bands[2] = weight
-    for k, a in enumerate(stencil):
-        for m, b in enumerate(stencil):
-            # In band form, element (row, column) lies at (2 + row - column, column).
-            bands[2 + k - m, m : m + height.size - 2] += penalty * a * b
-    return scipy.linalg.solve_banded((2, 2), bands, weight * height)
+    differences = scipy.sparse.diags([1.0, -2.0, 1.0], [0, 1, 2], shape=(height.size - 2, height.size))
+    matrix = scipy.sparse.diags(weight) + penalty * differences.T @ differences
+    return scipy.sparse.linalg.spsolve(matrix.tocsc(), weight * height)
 
 
 def _log_likelihood(
@@ -818,22 +812,11 @@ def _count_neighbours(x: np.ndarray, z: np.ndarray) -> np.ndarray:
 def _percentiles(
     z: np.ndarray, number: np.ndarray, n_segments: int, percentile: float, least: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Percentile of the values of each segment, as `numpy.percentile`, and their number.
-
-    NaN for fewer than `least` values. All values are sorted once, by segment and size; a segment's percentile
-    then lies at a position known from its count.
-    """
-    order = np.lexsort((z, number))
+    """Return the percentile of the values of each segment, NaN for fewer than `least`, and their number."""
     count = np.bincount(number, minlength=n_segments)
-    filled = np.flatnonzero(count >= least)
-    first = (np.cumsum(count) - count)[filled]
-    position = first + 0.01 * percentile * (count[filled] - 1)
-    low = np.floor(position).astype(int)
-    high = np.minimum(low + 1, max(z.size - 1, 0))
-    z = z[order]
-    percentiles = np.full(n_segments, np.nan)
-    percentiles[filled] = z[low] + (position - low) * (z[high] - z[low])
-    return percentiles, count
+    of_segments = np.split(z[np.argsort(number, kind="stable")], np.cumsum(count)[:-1])
+    percentiles = [np.percentile(a, percentile) if a.size >= least else np.nan for a in of_segments]
+    return np.array(percentiles), count
 
 
 def _canopy_percentile(

@@ -39,7 +39,7 @@ from jaxlidar.survey.records import (
 # Metres of height per ns of two-way travel at nadir: half the speed of light.
 METRES_PER_NS = 0.5 * SPEED_OF_LIGHT
 # Width of the smoothing over that of the Gaussian of the pulse's peak and area.
-_SMOOTHING = 0.83
+SMOOTHING = 0.83
 # Median of the absolute value of a normal variable of unit variance.
 NORMAL_MEDIAN = 0.6745
 # At least this fraction of the samples of a record without background is quiet: within these standard
@@ -177,7 +177,7 @@ def smooth_pulse(pulse: Float[Array, " lags"]) -> SmoothedPulse:
     """
     if pulse.size == 1:
         return SmoothedPulse(jnp.ones(1), jnp.zeros(()), jnp.zeros(1))
-    width = _SMOOTHING * jnp.sum(pulse) / math.sqrt(2.0 * math.pi)
+    width = SMOOTHING * jnp.sum(pulse) / math.sqrt(2.0 * math.pi)
     lag = jnp.arange(pulse.size, dtype=pulse.dtype) - pulse.size // 2
     kernel = jnp.exp(-0.5 * (lag / width) ** 2)
     kernel /= jnp.sum(kernel)

@@ -41,6 +41,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import scipy
 from jaxtyping import ArrayLike, Bool, Float, Int, PRNGKeyArray
@@ -51,11 +52,15 @@ from inversion.fit.unknowns import (
     BoundUnknown,
     Unknown,
     bind_unknowns,
+    bounds_by_name,
     flat_bounds,
     flat_start,
+    split_by_name,
+    unknown_outside_scene,
 )
+from inversion.receiver.recorder import bound_pair
 from inversion.scene.map_priors import MapPriors
-from inversion.scene.scene_retrieval import SceneRetrieval, make_scene_retrieval
+from inversion.scene.scene_retrieval import SceneRetrieval
 from inversion.scene.survey_model import Pulled, ShotGroups, SurveyModel
 from jaxlidar import Plan, Scene, Survey, Waveforms
 from jaxlidar.extend import (
@@ -261,22 +266,31 @@ def retrieve_scene(
         end = _fit(problem, max_steps, random, steps, progress)
         errors = _draws_of_error(problem, end, draws, host_key, stored_draws, progress)
         rows = _averaging_kernels(problem, end, places, stored_kernels, progress)
-        result = make_scene_retrieval(
-            unknowns=model.all_unknowns,
-            values=end.x,
-            draws=errors,
-            at_bound=~problem.is_free(end.x),
-            kernels=rows,
-            kernel_places=places,
-            scene=model.scene_at(end.x),
-            time=records.time,
-            wavelength=np.asarray(survey.lidar.wavelength),
-            fitted=end.pulled.records,
-            residuals=(records.observed - end.pulled.records) * weight,
-            held_out=is_held_out,
-            misfit=end.misfit,
-            held_out_misfit=end.held_out_misfit,
-            history=end.history,
+        x, fitted = end.evaluation.x, end.evaluation.pulled.records
+        flat_quantities = {
+            "values": x,
+            "stderr": np.sqrt(np.mean(errors**2, axis=0)) if draws else np.full(x.size, np.nan),
+            "draws": errors,
+            "at_bound": ~problem.is_free(x),
+        }
+        by_name = {n: split_by_name(a, model.all_unknowns) for n, a in flat_quantities.items()}
+        quantities = {
+            **by_name,
+            "averaging": rows,
+            "places": places,
+            "bounds": bounds_by_name(model.all_unknowns),
+            "time": records.time,
+            "wavelength": survey.lidar.wavelength,
+            "fitted": fitted,
+            "residuals": (records.observed - fitted) * weight,
+            "held_out": is_held_out,
+            "misfit": end.evaluation.misfit,
+            "held_out_misfit": end.evaluation.held_out_misfit,
+            "history": end.history,
+        }
+        result = SceneRetrieval(
+            **jax.tree.map(jnp.asarray, quantities),
+            scene=model.scene_at(x),
             converged=end.converged,
             status=end.status,
         )
@@ -503,7 +517,7 @@ class _Problem:
 
         def product(v: np.ndarray) -> np.ndarray:
             # The identity for values that are held, which keeps the matrix regular.
-            return free * self.product(end.x, free * v) + (1.0 - free) * v
+            return free * self.product(end.evaluation.x, free * v) + (1.0 - free) * v
 
         # SciPy's stubs know the constructor of the base class alone, without its functions.
         operator: Any = scipy.sparse.linalg.LinearOperator
@@ -548,12 +562,9 @@ def _best_gains(
 
 
 class _FitEnd(NamedTuple):
-    """The end of a fit: the values, their evaluation, the scale of the unknowns, and how it ended."""
+    """The end of a fit: the best evaluation, the scale of the unknowns, and how it ended."""
 
-    x: np.ndarray
-    pulled: Pulled
-    misfit: float
-    held_out_misfit: float
+    evaluation: _Evaluation
     scale: np.ndarray
     history: np.ndarray
     converged: bool
@@ -660,7 +671,7 @@ def _fit(
             # The start is a minimum: no step was taken.
             assert latest is not None
             history.append((latest.misfit, latest.held_out_misfit, latest.objective))
-    end = problem.evaluate(best_x)
+    best = problem.evaluate(best_x)
     what = "misfit of held-out shots" if has_held_out else "objective"
     if stopped:
         status = f"converged: the {what} no longer falls, after {len(history)} steps"
@@ -669,9 +680,7 @@ def _fit(
     else:
         status = f"not converged in {len(history)} steps: the {what} still falls; give more max_steps"
     table = np.array(history).reshape(-1, 3)
-    return _FitEnd(
-        best_x, end.pulled, end.misfit, end.held_out_misfit, scale, table, stopped or at_minimum, status
-    )
+    return _FitEnd(best, scale, table, stopped or at_minimum, status)
 
 
 def no_longer_falls(values: Float[np.ndarray, " steps"]) -> bool:
@@ -695,7 +704,8 @@ def _draws_of_error(
     progress: ProgressOption,
 ) -> Float[np.ndarray, "draws n"]:
     """Draw errors of the values from the linearised posterior."""
-    errors = np.zeros((draws, end.x.size))
+    best = end.evaluation
+    errors = np.zeros((draws, best.x.size))
     for number in range(draws):
         if stored := store.read(number):
             errors[number] = stored["error"]
@@ -705,15 +715,15 @@ def _draws_of_error(
         random = np.random.default_rng(np.asarray(seed).ravel())
         # The right side has the covariance H, so that H^-1 of it has the posterior's covariance H^-1.
         weight = problem.model.weight
-        of_data = problem.model.pull_back(end.x, random.normal(size=weight.shape) * weight)
-        jacobian = problem.priors.jacobian(end.x)
+        of_data = problem.model.pull_back(best.x, random.normal(size=weight.shape) * weight)
+        jacobian = problem.priors.jacobian(best.x)
         of_priors = jacobian.T @ random.normal(size=jacobian.shape[0])
-        of_bounds = np.sqrt(problem.bounds_precision) * random.normal(size=end.x.size)
+        of_bounds = np.sqrt(problem.bounds_precision) * random.normal(size=best.x.size)
         right_side = of_data + of_priors + of_bounds
         errors[number] = problem.solve(end, right_side)
         store.write(number, error=errors[number])
         if callable(progress):
-            progress(SceneStep("errors", number + 1, end.misfit, end.held_out_misfit))
+            progress(SceneStep("errors", number + 1, best.misfit, best.held_out_misfit))
     return errors
 
 
@@ -728,8 +738,8 @@ def _averaging_kernels(
 
     Rows of values at their bounds are zero.
     """
-    kernels, number = {}, 0
-    is_free = problem.is_free(end.x)
+    kernels, number, best = {}, 0, end.evaluation
+    is_free = problem.is_free(best.x)
     starts = np.cumsum([0, *problem.model.sizes])
     for start, u in zip(starts, problem.model.all_unknowns):
         if u.name not in places:
@@ -739,19 +749,19 @@ def _averaging_kernels(
             flat = int(start) + int(np.ravel_multi_index(tuple(index), u.start.shape))
             stored = store.read(number)
             if stored is None:
-                unit = np.zeros(end.x.size)
+                unit = np.zeros(best.x.size)
                 unit[flat] = 1.0
                 # A row of (H_FF)^-1 (J^T J)_F: by symmetry, J^T J times a column of (H_FF)^-1.
-                row = np.zeros(end.x.size)
+                row = np.zeros(best.x.size)
                 if is_free[flat]:
                     column = problem.solve(end, unit, is_free)
-                    row = problem.model.gauss_newton_product(end.x, column)
+                    row = problem.model.gauss_newton_product(best.x, column)
                 store.write(number, row=row)
             else:
                 row = stored["row"]
             number += 1
             rows.append(row[start : start + u.start.size].reshape(u.start.shape))
             if stored is None and callable(progress):
-                progress(SceneStep("averaging kernels", number, end.misfit, end.held_out_misfit))
+                progress(SceneStep("averaging kernels", number, best.misfit, best.held_out_misfit))
         kernels[u.name] = np.stack(rows)
     return kernels

@@ -1,19 +1,17 @@
 """`SceneRetrieval`: the result of a fit of many records of one scene."""
 
 import os
-from collections.abc import Mapping, Sequence
 from typing import Any, final
 
 import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from inversion.fit.fit_summary import short_text
-from inversion.fit.unknowns import BoundUnknown, bounds_by_name, split_by_name
+from inversion.fit.result import columns_of_unknowns
 from jaxlidar import Scene
 from jaxlidar.io import save
-from jaxlidar.results.datasets import datasets_of, variables_by_item
+from jaxlidar.results.datasets import datasets_of
 
 # Values of an unknown beyond which a summary shows quantiles.
 _FEW_VALUES = 8
@@ -113,12 +111,7 @@ class SceneRetrieval(eqx.Module):
         import xarray
 
         stored = datasets_of(self)["/"]
-        columns: dict[str, Any] = {}
-        for field in ("values", "stderr", "at_bound"):
-            suffix = "" if field == "values" else f" {field.replace('_', ' ')}"
-            for name, variable in variables_by_item(stored, field).items():
-                axes = {axis: f"{name} {i}" for i, axis in enumerate(stored[variable].dims)}
-                columns[f"{name}{suffix}"] = stored[variable].rename(axes)
+        columns = columns_of_unknowns(stored, ("values", "stderr", "at_bound"))
         for name in ("fitted", "residuals", "held_out"):
             columns[name] = stored[name]
         return xarray.Dataset(columns)
@@ -143,38 +136,3 @@ class SceneRetrieval(eqx.Module):
         if held_out:
             misfits += f", {float(self.held_out_misfit):.3g} over {held_out} held out"
         return "\n".join([*rows, f"{misfits}; {self.status}"])
-
-
-def make_scene_retrieval(
-    *,
-    unknowns: Sequence[BoundUnknown],
-    values: Float[np.ndarray, " n"],
-    draws: Float[np.ndarray, "draws n"],
-    at_bound: Bool[np.ndarray, " n"],
-    kernels: Mapping[str, np.ndarray],
-    kernel_places: Mapping[str, np.ndarray],
-    scene: Scene,
-    **quantities: Any,
-) -> SceneRetrieval:
-    """Return the result, with flattened quantities split by name of unknown."""
-    bounds = bounds_by_name(unknowns)
-    by_name = split_by_name(values, unknowns)
-    stderr = np.sqrt(np.mean(draws**2, axis=0)) if len(draws) else np.full(values.size, np.nan)
-    static = {name: quantities.pop(name) for name in ("converged", "status")}
-    arrays = {
-        "values": by_name,
-        "stderr": split_by_name(stderr, unknowns),
-        "draws": split_by_name(draws, unknowns),
-        "at_bound": split_by_name(at_bound, unknowns),
-        "averaging": dict(kernels),
-        "places": dict(kernel_places),
-        "bounds": bounds,
-        **quantities,
-    }
-    return SceneRetrieval(**{n: _as_jax(a) for n, a in arrays.items()}, scene=scene, **static)
-
-
-def _as_jax(quantity: Any) -> Any:
-    if isinstance(quantity, dict):
-        return {name: jnp.asarray(a) for name, a in quantity.items()}
-    return jnp.asarray(quantity)

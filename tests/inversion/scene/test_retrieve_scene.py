@@ -408,7 +408,7 @@ def test_averaging_kernels_hold_values_at_their_bounds():
 
     matrix = jacobian.T @ jacobian + precision
     problem = SimpleNamespace(product=lambda x, v: matrix @ v)
-    end = SimpleNamespace(x=x, scale=1.0 / np.sqrt(np.diag(matrix)))
+    end = SimpleNamespace(evaluation=SimpleNamespace(x=x), scale=1.0 / np.sqrt(np.diag(matrix)))
     columns = [retrieval._Problem.solve(problem, end, unit, ~at_bound) for unit in np.eye(6)]
     kernels = np.stack(columns) @ jacobian.T @ jacobian
     np.testing.assert_allclose(kernels, refits, atol=0.02)
