@@ -22,11 +22,11 @@ relief within the footprint does to the ground's echo.
 import dataclasses
 import os
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
 import jaxlidar as jl
 from inversion.fit.problem import Problem
@@ -78,27 +78,6 @@ LAYER_ESTIMATES = {
     "plant_area_density": ("m2 m-3", "plant area density of layers of equal thickness, from below"),
     "plant_area_density_stderr": ("m2 m-3", "standard error of the plant area density of layers"),
 }
-
-
-class GediFits(NamedTuple):
-    """Fits of shots, in the order of the shots. A shot without a fit has NaN and a bad verdict.
-
-    - `estimates`: (shots,) by the names of `ESTIMATES`, and (shots, layers) by those of `LAYER_ESTIMATES`.
-    - `verdicts`: of record and fit, about the ground.
-    - `start_ground`: (shots,) elevation in m that the ground started from.
-    - `elevation`, `signal`, `fitted`: (shots, samples) m from the top down, and counts of record and fit.
-    - `numbers`: (shots,) position of the fit of each shot in `retrievals`; -1 without.
-    - `retrievals`: all fits, of shots with two possible grounds both. None if no shot could be fitted.
-    """
-
-    estimates: dict[str, Float[np.ndarray, "shots ..."]]
-    verdicts: tuple[Verdict, ...]
-    start_ground: Float[np.ndarray, " shots"]
-    elevation: Float[np.ndarray, "shots samples"]
-    signal: Float[np.ndarray, "shots samples"]
-    fitted: Float[np.ndarray, "shots samples"]
-    numbers: Int[np.ndarray, " shots"]
-    retrievals: Retrieval | None
 
 
 def lidar_of(pulse: Any) -> jl.Lidar:
@@ -179,7 +158,7 @@ def fit_gedi_shots(
     *,
     path: str | os.PathLike[str] | None = None,
     progress: ProgressOption = None,
-) -> GediFits:
+) -> tuple[dict[str, Float[np.ndarray, "shots ..."]], list[Verdict]]:
     """Fit shots, some of them from two grounds, all in one batch.
 
     1. Prepare every shot about each of its possible grounds.
@@ -192,6 +171,9 @@ def fit_gedi_shots(
     - `ground`: (shots,) elevations of the matched mode in m. Shots with NaN are not fitted.
     - `lowest_mode`: (shots,) elevations of GEDI's lowest mode in m, NaN where there is none.
     - `path`, `progress`: as for `inversion.retrieve_many`.
+
+    **Returns:** estimates by column, (shots,) and (shots, layers), NaN without a fit; and verdicts of record
+    and fit, about the ground, bad without a fit.
 
     **Raises:** what `inversion.retrieve_many` raises for `path`; nothing for a single shot.
     """
@@ -208,7 +190,8 @@ def fit_gedi_shots(
         prepared += starts
     retrievals = _fit(prepared, path, progress) if prepared else None
     fit_verdicts = [judge_fit(fit, about=["ground"]) for fit in retrievals or ()]
-    fits = _empty_fits(len(shots), retrievals)
+    shapes = dict.fromkeys(ESTIMATES, ()) | dict.fromkeys(LAYER_ESTIMATES, (LAYERS,))
+    estimates = {name: np.full((len(shots), *shape), np.nan) for name, shape in shapes.items()}
     verdicts = []
     for i, (shot, numbers) in enumerate(zip(shots, candidates)):
         if isinstance(numbers, str) or retrievals is None:
@@ -218,17 +201,18 @@ def fit_gedi_shots(
         best, *alternatives = sorted(
             numbers, key=lambda n: (not retrievals.converged[n], retrievals.reduced_chi2[n])
         )
-        _store(fits, i, prepared[best], retrievals, best)
+        for name, value in _estimates(prepared[best], retrievals, best).items():
+            estimates[name][i] = value
         verdict = judge_shot(shot) & fit_verdicts[best]
         for n in alternatives:
             if retrievals.reduced_chi2[n] < _CHI2_FACTOR * retrievals.reduced_chi2[best]:
                 reason = f"ground at {prepared[n].ground:.1f} m fits nearly as well"
                 verdict &= Verdict("doubtful", (f"second minimum: {reason}",))
-        distance = fits.estimates["ground"][i] - prepared[best].ground
+        distance = estimates["ground"][i] - prepared[best].ground
         if abs(distance) > _DOUBTFUL_DISTANCE:
             verdict &= Verdict("doubtful", (f"ground {distance:+.2f} m from the mode it started from",))
         verdicts.append(verdict)
-    return fits._replace(verdicts=tuple(verdicts))
+    return estimates, verdicts
 
 
 def _prepare(shot: Any, ground: float, lowest_mode: float) -> list[PreparedShot]:
@@ -280,28 +264,12 @@ def _padded_pulse(shot: Any, size: int) -> jl.SampledPulse:
     return jl.SampledPulse(time=np.r_[time, later], power=np.r_[power, np.zeros(later.size)])
 
 
-def _empty_fits(shots: int, retrievals: Retrieval | None) -> GediFits:
-    """Return fits of shots that have none."""
-    shapes = dict.fromkeys(ESTIMATES, (shots,)) | dict.fromkeys(LAYER_ESTIMATES, (shots, LAYERS))
-    samples = (shots, _ABOVE + _BELOW + 1)
-    return GediFits(
-        estimates={name: np.full(shape, np.nan) for name, shape in shapes.items()},
-        verdicts=(),
-        start_ground=np.full(shots, np.nan),
-        elevation=np.full(samples, np.nan),
-        signal=np.full(samples, np.nan),
-        fitted=np.full(samples, np.nan),
-        numbers=np.full(shots, -1),
-        retrievals=retrievals,
-    )
-
-
-def _store(fits: GediFits, i: int, prepared: PreparedShot, retrievals: Retrieval, number: int) -> None:
-    """Write the estimates of shot `i`, those of a fit by its number in `retrievals`, into `fits`."""
+def _estimates(prepared: PreparedShot, retrievals: Retrieval, number: int) -> dict[str, Any]:
+    """Return the estimates of a shot, those of a fit by its number, by the names of its columns."""
     values = {name: np.asarray(value[number], float) for name, value in retrievals.values.items()}
     stderr = {name: np.asarray(error[number], float) for name, error in retrievals.robust_stderr.items()}
     canopy = CANOPY.estimates(retrievals, number)
-    estimates = {
+    return {
         "ground": prepared.reference + values["ground"],
         "ground_stderr": stderr["ground"],
         "canopy_top": prepared.reference + canopy.top,
@@ -314,9 +282,3 @@ def _store(fits: GediFits, i: int, prepared: PreparedShot, retrievals: Retrieval
         "plant_area_density": canopy.density,
         "plant_area_density_stderr": canopy.density_stderr,
     }
-    for name, value in estimates.items():
-        fits.estimates[name][i] = value
-    fits.start_ground[i], fits.numbers[i] = prepared.ground, number
-    fits.elevation[i] = prepared.elevation
-    fits.signal[i] = prepared.signal * prepared.total
-    fits.fitted[i] = values["scale"] * retrievals.fitted[number, 0] * prepared.total

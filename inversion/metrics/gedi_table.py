@@ -620,7 +620,7 @@ def _fit_columns(
     **Arguments:** `verdicts`: of the closed forms, which say why shots without a ground have none.
     """
     (with_ground,) = np.nonzero(np.isfinite(estimates["ground"]))
-    fits = fit_gedi_shots(
+    fitted, verdicts_of_fits = fit_gedi_shots(
         [rows[i] for i in with_ground],
         estimates["ground"][with_ground],
         estimates["elev_lowestmode_a1"][with_ground],
@@ -628,14 +628,13 @@ def _fit_columns(
         progress=progress,
     )
     fit_verdicts = list(verdicts)
-    for i, verdict in zip(with_ground, fits.verdicts):
+    for i, verdict in zip(with_ground, verdicts_of_fits):
         fit_verdicts[i] = verdict
     layers = ColumnAxis("fit_layer", np.arange(1.0, LAYERS + 1.0))
     columns = {}
     for name, (unit, text) in (ESTIMATES | LAYER_ESTIMATES).items():
-        fitted = fits.estimates[name]
-        values = np.full((len(rows), *fitted.shape[1:]), np.nan)
-        values[with_ground] = fitted
+        values = np.full((len(rows), *fitted[name].shape[1:]), np.nan)
+        values[with_ground] = fitted[name]
         axis = layers if name in LAYER_ESTIMATES else None
         columns[f"fit_{name}"] = Column(values, unit, f"fit: {text}", axis)
     for name, text in zip(("quality", "reasons"), _verdict_columns(fit_verdicts)):

@@ -105,14 +105,12 @@ def test_shots_without_a_fit_have_columns_of_nan_and_the_reason(tmp_path):
 def test_a_shot_that_cannot_be_prepared_is_bad():
     negative = shot(pulse_power=np.where(np.abs(np.arange(81) - 40) < 20, 1.0, -0.1))
     shots = [shot(), negative, shot(noise_std=0.0)]
-    fits = gedi_fit.fit_gedi_shots(shots, np.array([np.nan, 100.0, 100.0]), np.full(3, np.nan))
-    assert [verdict.quality for verdict in fits.verdicts] == ["bad", "bad", "bad"]
-    assert fits.verdicts[0].reasons == ("no ground above the noise",)
-    assert "power" in fits.verdicts[1].reasons[0]
-    assert fits.verdicts[2].reasons == ("noise_std = 0; a fit needs a record with noise",)
-    assert fits.retrievals is None
-    assert fits.numbers.tolist() == [-1, -1, -1]
-    assert fits.fitted.shape == fits.signal.shape == fits.elevation.shape
+    estimates, verdicts = gedi_fit.fit_gedi_shots(shots, np.array([np.nan, 100.0, 100.0]), np.full(3, np.nan))
+    assert [verdict.quality for verdict in verdicts] == ["bad", "bad", "bad"]
+    assert verdicts[0].reasons == ("no ground above the noise",)
+    assert "power" in verdicts[1].reasons[0]
+    assert verdicts[2].reasons == ("noise_std = 0; a fit needs a record with noise",)
+    assert all(np.all(np.isnan(values)) for values in estimates.values())
 
 
 def test_the_command_stores_fits_until_the_table_is_written(tmp_path, monkeypatch, capsys):
