@@ -5,8 +5,6 @@ kind of number; from these,
 
 - `inversion.fit.result` makes a `Retrieval` from one summary, or from many;
 - `to_arrays` and `from_arrays` write a row of a store, and read it.
-
-`FitDetails` holds what only the result of a single fit has.
 """
 
 import dataclasses
@@ -139,8 +137,8 @@ class FitSummary:
 
 
 @dataclasses.dataclass(frozen=True)
-class FitDetails:
-    """Further quantities of one fit, which are neither stored nor given for many fits.
+class CompletedFit:
+    """A fit that has ended: its summary, and what is neither stored nor given for many fits.
 
     - `waveform_stderr`: (wavelengths, bins) standard error of the simulated waveform.
     - `cost`: chi-squared by the noise of measurement and pulse, without the simulation's, plus `prior_cost`:
@@ -153,6 +151,7 @@ class FitDetails:
     - `evaluation`: the simulation at the estimates.
     """
 
+    summary: FitSummary
     waveform_stderr: np.ndarray
     cost: float
     prior_cost: float
@@ -161,13 +160,6 @@ class FitDetails:
     noise: SampleNoise
     history: tuple[float, ...]
     evaluation: Evaluation
-
-
-class CompletedFit(NamedTuple):
-    """A fit that has ended."""
-
-    summary: FitSummary
-    details: FitDetails
 
     @staticmethod
     def of_zeros(sizes: SummarySizes, *, status: str) -> "CompletedFit":
@@ -181,7 +173,8 @@ class CompletedFit(NamedTuple):
             quantities.setdefault(field.name, zeros if zeros.ndim else zeros.item())
         record = np.zeros((sizes.wavelengths, sizes.bins))
         nothing = np.zeros(0)
-        details = FitDetails(
+        return CompletedFit(
+            FitSummary(**quantities),
             waveform_stderr=record,
             cost=0.0,
             prior_cost=0.0,
@@ -191,4 +184,3 @@ class CompletedFit(NamedTuple):
             history=(),
             evaluation=Evaluation(record, record[..., None], None, None),
         )
-        return CompletedFit(FitSummary(**quantities), details)

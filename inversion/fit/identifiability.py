@@ -317,13 +317,13 @@ def profile_likelihood(
                 progress(i)
     # From the order in which fits ran to that of the values.
     ordered = [fits[i] for i in range(points.size)]
-    noise = min(ordered, key=lambda fit: fit.details.cost).details.noise
+    noise = min(ordered, key=lambda fit: fit.cost).noise
     chi2 = np.zeros(points.size)
     for i, fit in fits.items():
         values_of_all = {**estimates[i], name: points[i]}
         # The prior of the fixed unknown counts as well.
         flat = np.concatenate([np.ravel(values_of_all[u.name]) for u in unknowns])
-        residual = np.append(noise.whiten(fit.details.difference), priors(flat)[0])
+        residual = np.append(noise.whiten(fit.difference), priors(flat)[0])
         chi2[i] = residual @ residual
     return Profile(
         values=points,

@@ -117,8 +117,8 @@ def estimate_derivatives(
     **Arguments:** `stated_noise`: of the record, before it is raised to the floor. `unknowns`: of the scene,
     then those of the recorder.
     """
-    is_fitted, noise, evaluation = observed.is_fitted, fit.details.noise, fit.details.evaluation
-    values, difference = fit.summary.values, fit.details.difference
+    is_fitted, noise, evaluation = observed.is_fitted, fit.noise, fit.evaluation
+    values, difference = fit.summary.values, fit.difference
     recorder_values = values[values.size - recorder.count :]
     _, jacobian = recorder(evaluation.reflectance, evaluation.jacobian, recorder_values)
     jacobian = jacobian[is_fitted]

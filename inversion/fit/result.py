@@ -277,7 +277,7 @@ def retrieval_of(
         labels=flat_labels(unknowns),
         scene=scene,
         waveform=waveform,
-        history=fit.details.history,
+        history=fit.history,
     )
 
 

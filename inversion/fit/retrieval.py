@@ -241,7 +241,7 @@ def retrieval_of_record(problem: BoundProblem, fitted: FittedRecord) -> Retrieva
     fit, model, recorder = fitted
     # The recorder's unknowns come last, and are none of the scene's.
     scene_values = fit.summary.values[: fit.summary.values.size - recorder.count]
-    waveform = model.waveform(scene_values, fit.details.evaluation, fit.details.waveform_stderr)
+    waveform = model.waveform(scene_values, fit.evaluation, fit.waveform_stderr)
     return retrieval_of(fit, problem.all_unknowns, model.scene_at(scene_values), waveform)
 
 

@@ -41,7 +41,7 @@ from jaxtyping import Float, PRNGKeyArray
 
 from inversion.fit.bounded_gauss_newton import BoundedGaussNewton, advance, at_bounds
 from inversion.fit.data import ObservedWaveform, SampleNoise
-from inversion.fit.fit_summary import CompletedFit, FitDetails, FitSummary, Step
+from inversion.fit.fit_summary import CompletedFit, FitSummary, Step
 from inversion.fit.model import Evaluation, batch_stderr
 from inversion.fit.prior_residuals import PriorResiduals
 from inversion.fit.recorder_model import RecorderModel
@@ -424,7 +424,8 @@ class LeastSquaresFit:
             residuals=residuals,
             fitted=np.asarray(evaluation.reflectance),
         )
-        details = FitDetails(
+        return CompletedFit(
+            summary,
             waveform_stderr=np.asarray(np.broadcast_to(batch_stderr(evaluation.batches), is_fitted.shape)),
             cost=cost if iterate.is_finite else np.inf,
             prior_cost=prior_cost,
@@ -434,7 +435,6 @@ class LeastSquaresFit:
             history=tuple(self.history),
             evaluation=evaluation,
         )
-        return CompletedFit(summary, details)
 
     def _deviations(self, iterate: Iterate) -> np.ndarray | None:
         """Return the deviations of the batches from their mean, (batches, samples), or None for one batch."""
@@ -553,12 +553,12 @@ def multistart(fits: Sequence[LeastSquaresFit]) -> FitGenerator:
 
     def rank(fit: CompletedFit) -> tuple[bool, bool, float]:
         # Infinite and NaN costs come last.
-        return not fit.summary.converged, not np.isfinite(fit.details.cost), fit.details.cost
+        return not fit.summary.converged, not np.isfinite(fit.cost), fit.cost
 
     best = min(completed, key=rank)
     if len(fits) == 1:
         return best
-    further_fits = [fit for fit in completed if np.isfinite(fit.details.cost) and fit is not best]
+    further_fits = [fit for fit in completed if np.isfinite(fit.cost) and fit is not best]
     second_minimum_rise, robust_stderr = compare_minima(best, further_fits)
     n_same = sum(f.summary.converged and not ended_elsewhere(f, best) for f in completed)
     summary = dataclasses.replace(
@@ -568,8 +568,8 @@ def multistart(fits: Sequence[LeastSquaresFit]) -> FitGenerator:
         second_minimum=second_minimum_rise,
         robust_stderr=robust_stderr,
     )
-    history = tuple(chi2 for fit in completed for chi2 in fit.details.history)
-    return CompletedFit(summary, dataclasses.replace(best.details, history=history))
+    history = tuple(chi2 for fit in completed for chi2 in fit.history)
+    return dataclasses.replace(best, summary=summary, history=history)
 
 
 def ended_elsewhere(fit: CompletedFit, best: CompletedFit) -> bool:
@@ -597,10 +597,10 @@ def compare_minima(best: CompletedFit, further_fits: Sequence[CompletedFit]) -> 
     # Residuals of samples that are left out are zero.
     n_samples = max(np.count_nonzero(best.summary.residuals), 1)
     scale = summary.independent_samples / n_samples / max(summary.reduced_chi2, 1.0)
-    least_chi2, least_variance = _chi2_with_noise(best, best.details.noise)
+    least_chi2, least_variance = _chi2_with_noise(best, best.noise)
     second_minimum_rise, weighted_squares, weight = np.inf, np.zeros_like(summary.values), 1.0
     for fit in further_fits:
-        chi2, variance = _chi2_with_noise(fit, best.details.noise)
+        chi2, variance = _chi2_with_noise(fit, best.noise)
         rise = max(chi2 - least_chi2 - 2.0 * np.sqrt(variance + least_variance), 0.0) * scale
         if ended_elsewhere(fit, best):
             second_minimum_rise = min(second_minimum_rise, rise)
@@ -617,12 +617,12 @@ def _chi2_with_noise(fit: CompletedFit, noise: SampleNoise) -> tuple[float, floa
     adds sum_b |d_b|^2 / n (n - 1) to |r|^2 in the mean, which is subtracted. The variance is, to first order,
     4 sum_b (r . d_b)^2 / n (n - 1).
     """
-    residual = noise.whiten(fit.details.difference)
-    chi2 = float(residual @ residual) + fit.details.prior_cost
-    if fit.details.deviations is None:
+    residual = noise.whiten(fit.difference)
+    chi2 = float(residual @ residual) + fit.prior_cost
+    if fit.deviations is None:
         return chi2, 0.0
     # Columns are batches.
-    deviations = noise.whiten(fit.details.deviations.T)
+    deviations = noise.whiten(fit.deviations.T)
     pairs = deviations.shape[1] * (deviations.shape[1] - 1)
     mean_excess = float(np.sum(deviations**2)) / pairs
     return chi2 - mean_excess, 4.0 * float(np.sum((residual @ deviations) ** 2)) / pairs

@@ -203,12 +203,7 @@ def compare(
         if classes is not None:
             for label in np.unique(pair.group):
                 of_class = pair.group == label
-                members = pair._replace(
-                    reference=pair.reference[of_class],
-                    estimate=pair.estimate[of_class],
-                    stderr=pair.stderr[of_class],
-                    group=pair.group[of_class],
-                )
+                members = ComparedColumn(*(a[of_class] for a in pair[:4]))
                 statistics.append(_statistics(name, str(label), members, sigmas))
     return Comparison(tuple(statistics), pairs, float(sigmas))
 

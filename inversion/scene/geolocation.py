@@ -258,7 +258,7 @@ def geolocate(
         _descend_with_misfit(model, start)
         for start in _coarse_minima(model, radius, float(np.sqrt(footprint[0, 0])))
     ]
-    return _geolocation(min(ends, key=lambda end: end.deviance), model, radius, records)
+    return _geolocation(min(ends, key=lambda end: end.fit.deviance), model, radius, records)
 
 
 # -- records -----------------------------------------------------------------------------------------------
@@ -764,11 +764,6 @@ class _Descent(NamedTuple):
     fit: _Fit
     misfit: _Misfit | None
     converged: bool
-
-    @property
-    def deviance(self) -> float:
-        """-2 ln of the restricted likelihood, and the priors."""
-        return self.fit.deviance
 
 
 def _descend_with_misfit(model: _SurveyModel, parameters: np.ndarray) -> _Descent:

@@ -36,7 +36,7 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from inversion.fit.model import check_position
 from inversion.fit.planning import corner_cases
-from inversion.fit.unknowns import BoundUnknown, Setter, set_values
+from inversion.fit.unknowns import BoundUnknown, Setter, set_values, split_by_name
 from jaxlidar import Lidar, Plan, Scene, Survey, VoxelMap, make_setup
 from jaxlidar.extend import Program, side_by_side
 from jaxlidar.spectral.apply_optics import make_waveform_model, total_samples
@@ -256,15 +256,10 @@ class SurveyModel:
 
     def split(self, flat: Float[np.ndarray, " n"]) -> tuple[Values, np.ndarray, np.ndarray]:
         """Return values of the scene's unknowns, gains and offsets of all shots, from one vector."""
-        pieces = np.split(np.asarray(flat), np.cumsum(self.sizes)[:-1])
-        values = tuple(
-            jnp.asarray(p.reshape(u.start.shape), u.start.dtype) for p, u in zip(pieces, self.unknowns)
-        )
-        # Gains and offsets come last, if they are unknowns at all.
-        of_groups = iter(pieces[len(self.unknowns) :])
-        shots = len(self.groups.group)
-        gain = np.ones(shots) if self.groups.gain is None else next(of_groups)[self.groups.group]
-        offset = np.zeros(shots) if self.groups.offset is None else next(of_groups)[self.groups.group]
+        by_name, group = split_by_name(flat, self.all_unknowns), self.groups.group
+        values = tuple(jnp.asarray(by_name[u.name], u.start.dtype) for u in self.unknowns)
+        gain = np.ones(len(group)) if self.groups.gain is None else by_name["gain"][group]
+        offset = np.zeros(len(group)) if self.groups.offset is None else by_name["offset"][group]
         return values, gain, offset
 
     def split_tangent(self, flat: Float[np.ndarray, " n"]) -> tuple[Values, np.ndarray, np.ndarray]:

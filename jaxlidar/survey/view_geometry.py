@@ -31,19 +31,6 @@ _CELLS = 12
 _NOWHERE = 1e6
 
 
-class CandidateCells(NamedTuple):
-    """Cells of a group of nodes.
-
-    - `low`: their corner, m from the group's aim point. - `edge`: m. - `shape`: number along x and y.
-    - `shots`: of each cell, the numbers within the group of the shots that may see what enters or ends there.
-    """
-
-    low: Float[np.ndarray, "2"]
-    edge: float
-    shape: tuple[int, int]
-    shots: Any
-
-
 class ViewGeometry(NamedTuple):
     """Beams and fields of view of shots of one direction, and the sizes of arrays of all groups of nodes.
 
@@ -75,9 +62,9 @@ class ViewGeometry(NamedTuple):
         )
         # Sizes alone are stored: `views_of_group` makes the cells of a group again, in the task that needs
         # them.
-        cells_by_group = [geometry._candidate_cells(group, spacing) for group in groups]
-        nx, ny = (size_bucket(max(cells.shape[k] for cells in cells_by_group), 4) for k in range(2))
-        candidates = max(len(shots) for cells in cells_by_group for shots in cells.shots)
+        _, _, shapes, shots = zip(*(geometry._candidate_cells(group, spacing) for group in groups))
+        nx, ny = (size_bucket(max(n), 4) for n in zip(*shapes))
+        candidates = max(len(of_cell) for of_group in shots for of_cell in of_group)
         return geometry._replace(cell_shape=(nx, ny, size_bucket(candidates, 8)))
 
     @property
@@ -111,8 +98,14 @@ class ViewGeometry(NamedTuple):
         rotation = np.array([[x, -y], [y, x]]) / math.hypot(x, y) if self.beam.is_oblique else np.eye(2)
         return position @ rotation * np.array([-z, 1.0])
 
-    def _candidate_cells(self, group: NodeGroup, spacing: float) -> CandidateCells:
-        """Divide the surroundings of a group into cells, and list the shots that may see each."""
+    def _candidate_cells(
+        self, group: NodeGroup, spacing: float
+    ) -> tuple[Float[np.ndarray, "2"], float, tuple[int, int], Any]:
+        """Divide the surroundings of a group into cells, and list the shots that may see each.
+
+        **Returns:** the corner of the cells, m from the group's aim point; their edge, m; their number along x
+        and y; and of each the numbers within the group of the shots that may see its light.
+        """
         shot_position = self.position[group.shots] - group.aim
         edge = self.extent / _CELLS
         if self.by_path_end:
@@ -127,7 +120,7 @@ class ViewGeometry(NamedTuple):
         distance = self.extent + edge * math.sqrt(0.5)
         tree = scipy.spatial.KDTree(self._across(shot_position))
         shots = tree.query_ball_point(self._across(middle), distance, return_sorted=True)
-        return CandidateCells(low, edge, (len(x), len(y)), shots)
+        return low, edge, (len(x), len(y)), shots
 
     def views_of_group(self, group: NodeGroup, spacing: float) -> ShotViews:
         """Return the arrays for the shots of a group, padded with the number of a shot that sees nothing.

@@ -89,15 +89,16 @@ def test_a_fit_ends_where_one_with_all_batches_does(monkeypatch):
     distances_of_pilot_fits, n_traced = [], []
     for seed in range(8):
         with_pilot, with_all = BatchedSimulation(PILOT_BATCHES, seed), BatchedSimulation(MIN_BATCHES, seed)
-        (a, details), (b, _) = fit_echoes(with_pilot, seed), fit_echoes(with_all, seed)
+        fit = fit_echoes(with_pilot, seed)
+        a, b = fit.summary, fit_echoes(with_all, seed).summary
         assert a.converged
         assert b.converged
         assert distance(a, b) < 0.1
         np.testing.assert_allclose(a.stderr, b.stderr, rtol=0.02)
         np.testing.assert_allclose(a.simulation_error, b.simulation_error, rtol=0.03)
         assert a.reduced_chi2 == pytest.approx(b.reduced_chi2, abs=0.01)
-        assert details.evaluation.batches.shape[0] == MIN_BATCHES
-        assert not details.evaluation.is_pilot
+        assert fit.evaluation.batches.shape[0] == MIN_BATCHES
+        assert not fit.evaluation.is_pilot
         n_traced.append((with_pilot.n_traced, with_all.n_traced))
         # Negative control: a fit that stopped at what the pilot batches say ends elsewhere.
         pilot_only = BatchedSimulation(MIN_BATCHES, seed)
@@ -110,8 +111,9 @@ def test_a_fit_ends_where_one_with_all_batches_does(monkeypatch):
 
 def test_steps_are_simulations_with_pilot_batches_or_all():
     simulation, steps = BatchedSimulation(PILOT_BATCHES), []
-    record, details = fit_echoes(simulation, 0, progress=steps.append)
-    assert record.steps == len(details.history) == len(steps)
+    fit = fit_echoes(simulation, 0, progress=steps.append)
+    record = fit.summary
+    assert record.steps == len(fit.history) == len(steps)
     assert [s.number for s in steps] == list(range(1, record.steps + 1))
     n_full = (simulation.n_traced - PILOT_BATCHES * record.steps) / (MIN_BATCHES - PILOT_BATCHES)
     assert 2 <= n_full < record.steps
@@ -120,10 +122,11 @@ def test_steps_are_simulations_with_pilot_batches_or_all():
 
 @pytest.mark.parametrize("max_steps", [1, 2, 3, 4, 5])
 def test_a_fit_that_is_stopped_has_simulated_with_all_batches(max_steps):
-    record, details = fit_echoes(BatchedSimulation(PILOT_BATCHES), 0, max_steps=max_steps)
+    fit = fit_echoes(BatchedSimulation(PILOT_BATCHES), 0, max_steps=max_steps)
+    record = fit.summary
     assert record.status.startswith("not converged: stopped at max_steps")
     assert record.steps == max_steps
-    assert not details.evaluation.is_pilot
+    assert not fit.evaluation.is_pilot
     assert np.all(record.simulation_error > 0)
 
 
