@@ -190,7 +190,6 @@ class FinishedFits:
     """Records of the fits that have ended, by footprint, and their store, if there is one."""
 
     def __init__(self, store: ResultStore | None, n_footprints: int):
-        self.n_footprints = n_footprints
         self._rows = None if store is None else store.rows("", "footprint", n_footprints, _FITS_PER_CHUNK)
         self._unwritten: set[int] = set()
         self._has_warned = False

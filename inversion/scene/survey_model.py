@@ -262,12 +262,6 @@ class SurveyModel:
         offset = np.zeros(len(group)) if self.groups.offset is None else by_name["offset"][group]
         return values, gain, offset
 
-    def split_tangent(self, flat: Float[np.ndarray, " n"]) -> tuple[Values, np.ndarray, np.ndarray]:
-        """Return the same of a tangent: gains that are not unknown do not change."""
-        # `split` gives fixed gains their value 1, which as a tangent would be a change.
-        values, gain, offset = self.split(flat)
-        return values, np.zeros_like(gain) if self.groups.gain is None else gain, offset
-
     def scene_at(self, flat: Float[np.ndarray, " n"]) -> Scene:
         """Return the scene with these values."""
         return set_values(self.inputs.scene, self.inputs.setters, self.split(flat)[0])
@@ -305,7 +299,10 @@ class SurveyModel:
     ) -> Float[np.ndarray, " n"]:
         """Return J^T J v, of records over their standard deviations."""
         values, gain, _ = self.split(flat)
-        tangents, gain_tangent, offset_tangent = self.split_tangent(v)
+        tangents, gain_tangent, offset_tangent = self.split(v)
+        if self.groups.gain is None:
+            # Fixed gains have the value 1, which as a tangent would be a change.
+            gain_tangent = np.zeros_like(gain)
 
         def product(number: int) -> Any:
             rows = self.rows[number]

@@ -524,6 +524,11 @@ class _Echoes(NamedTuple):
     end: Int[np.ndarray, " echoes"]
 
 
+def _no_echoes() -> _Echoes:
+    none, empty = np.zeros(0, int), np.zeros(0)
+    return _Echoes(none, empty, empty, empty, none, none)
+
+
 class _Peaks(NamedTuple):
     """Largest samples of echoes, as indices of records one after another; `row`: number of the record.
 
@@ -542,25 +547,19 @@ def _find_echoes(
     detector: str,
     record: Float[np.ndarray, "shots samples"],
     noise: Float[np.ndarray, "..."],
-    threshold: Float[np.ndarray, " shots"] | None,
+    levels: Float[np.ndarray, "..."],
     fraction: float,
     pulse: Float[np.ndarray, " lags"],
 ) -> _Echoes:
     """Detect echoes in records without background; see the module's docstring.
 
-    **Arguments:** `noise`: (shots, 1) or (shots, samples) standard deviation. `threshold`: (shots,), or
-    None for the default.
+    **Arguments:** `noise`, `levels`: (shots, 1) or (shots, samples) standard deviation, and threshold.
     """
     shots, samples = record.shape
     # A sample of zero before and after each record, so that records can lie one after another in one array.
     width = samples + 2
     padded = np.zeros((shots, width), record.dtype)
     padded[:, 1:-1] = record
-    largest = record.max(axis=1)
-    if threshold is None:
-        levels = np.maximum(_NOISE_FACTOR * noise, _RELATIVE_THRESHOLD * largest[:, None])
-    else:
-        levels = threshold[:, None].astype(record.dtype)
     flat = padded.ravel()
     # The first sample of a plateau counts. Records without light have no threshold above zero.
     is_maximum = (record >= levels) & (record > 0) & (record > padded[:, :-2]) & (record >= padded[:, 2:])
@@ -568,8 +567,7 @@ def _find_echoes(
     level = levels[rows, columns if levels.shape[1] > 1 else 0]
     peaks = _group_maxima(detector, flat, rows * width + columns + 1, rows, level, fraction, width)
     if peaks.index.size == 0:
-        empty, none = np.zeros(0), np.zeros(0, int)
-        return _Echoes(none, empty, empty, empty, none, none)
+        return _no_echoes()
 
     position, amplitude = _apex(flat, peaks.index)
     full_width = _full_widths(flat, peaks, position, amplitude)
@@ -978,8 +976,8 @@ def _recorded_background(waves: DetectorInput) -> float:
 
 def _prepare_chunk(
     waves: DetectorInput, record: np.ndarray, shots: slice, settings: _Settings
-) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
-    """Return the records without background, their noise, and the threshold of each, of a chunk of shots."""
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the records of a chunk of shots without background, their noise, and their thresholds."""
     record = np.ascontiguousarray(record)
     if settings.background is not None:
         level = settings.background[shots, None]
@@ -997,7 +995,14 @@ def _prepare_chunk(
         else:
             noise = np.zeros((len(record), 1), record.dtype)
     threshold = None if settings.threshold is None else settings.threshold[shots]
-    return record, noise, threshold
+    return record, noise, _levels(record, noise, threshold)
+
+
+def _levels(record: np.ndarray, noise: np.ndarray, threshold: np.ndarray | None) -> np.ndarray:
+    """Return the thresholds of records, (shots, 1) or (shots, samples); by default (None) by their noise."""
+    if threshold is not None:
+        return threshold[:, None].astype(record.dtype)
+    return np.maximum(_NOISE_FACTOR * noise, _RELATIVE_THRESHOLD * record.max(axis=1, keepdims=True))
 
 
 def _noise_of_records(waves: DetectorInput, records: np.ndarray) -> Float[np.ndarray, " shots"]:
@@ -1063,10 +1068,10 @@ def _detect_chunk(
     waves: DetectorInput, record: np.ndarray, shots: slice, settings: _Settings
 ) -> dict[str, np.ndarray]:
     """Return the columns of the returns of a chunk of shots, found by all but the decomposition."""
-    record, noise, threshold = _prepare_chunk(waves, record, shots, settings)
+    record, noise, levels = _prepare_chunk(waves, record, shots, settings)
     pulse, detector = waves.acquisition.pulse, settings.detector
     if isinstance(detector, str):
-        echoes = _find_echoes(detector, record, noise, threshold, settings.fraction, pulse)
+        echoes = _find_echoes(detector, record, noise, levels, settings.fraction, pulse)
     else:
         length = -(-pulse.size // PULSE_OVERSAMPLING)
         echoes = _find_echoes_by_function(detector, waves.time, record, noise, shots.start, length)
@@ -1158,27 +1163,21 @@ def _decompose_chunk(
     1. Find the stretches of each record in which it exceeds the threshold, a pulse's length more at either
     end. 2. Sort them by length, and decompose as many at once as one compiled program takes.
     """
-    record, noise, threshold = _prepare_chunk(waves, record, shots, settings)
+    record, noise, levels = _prepare_chunk(waves, record, shots, settings)
     largest = record.max(axis=1, initial=0.0)[:, None]
-    if threshold is None:
-        threshold = np.maximum(_NOISE_FACTOR * noise, _RELATIVE_THRESHOLD * largest)
-    else:
-        threshold = threshold[:, None]
     pulse = waves.acquisition.pulse[
         waves.acquisition.pulse.size // 2 % PULSE_OVERSAMPLING :: PULSE_OVERSAMPLING
     ]
     margin = pulse.size // 2 + 1
-    windows = _signal_windows((record >= threshold) & (record > 0), margin)
+    windows = _signal_windows((record >= levels) & (record > 0), margin)
     # Noise-free records are decomposed to the precision of the threshold.
     sigma = np.broadcast_to(np.maximum(noise, 0.2 * _RELATIVE_THRESHOLD * largest), record.shape)
     order = np.argsort([end - start for _, start, end in windows], kind="stable")
     for first in range(0, len(order), _RECORDS_AT_ONCE):
         batch = [windows[k] for k in order[first : first + _RECORDS_AT_ONCE]]
-        yield _columns(waves, record, shots, _decompose_windows(record, sigma, threshold, batch, pulse))
+        yield _columns(waves, record, shots, _decompose_windows(record, sigma, levels, batch, pulse))
     if not windows:
-        none = np.zeros(0, int)
-        empty = _Echoes(none, np.zeros(0), np.zeros(0), np.zeros(0), none, none)
-        yield _columns(waves, record, shots, empty)
+        yield _columns(waves, record, shots, _no_echoes())
 
 
 def _signal_windows(is_signal: Bool[np.ndarray, "shots samples"], margin: int) -> list[tuple[int, int, int]]:

@@ -103,8 +103,8 @@ class ViewGeometry(NamedTuple):
     ) -> tuple[Float[np.ndarray, "2"], float, tuple[int, int], Any]:
         """Divide the surroundings of a group into cells, and list the shots that may see each.
 
-        **Returns:** the corner of the cells, m from the group's aim point; their edge, m; their number along x
-        and y; and of each the numbers within the group of the shots that may see its light.
+        **Returns:** the corner of the cells, m from the group's aim point; their edge, m; their number along
+        x and y; and of each the numbers within the group of the shots that may see its light.
         """
         shot_position = self.position[group.shots] - group.aim
         edge = self.extent / _CELLS

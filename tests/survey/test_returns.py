@@ -10,7 +10,7 @@ import pytest
 import jaxlidar as jl
 from jaxlidar.io import FileWarning
 from jaxlidar.survey.acquisition import PULSE_OVERSAMPLING, sampled_pulse
-from jaxlidar.survey.returns import _find_echoes, _median_beside_echoes, position_along_beam
+from jaxlidar.survey.returns import _find_echoes, _levels, _median_beside_echoes, position_along_beam
 
 DETECTORS = ("peak", "constant fraction", "leading edge")
 STD = 3.0
@@ -28,7 +28,12 @@ def gaussian_record(*echoes, samples=120):
 def find(detector, *records, noise=0.0, threshold=None, fraction=0.5):
     records = np.stack(records)
     limits = None if threshold is None else np.full(len(records), threshold)
-    return _find_echoes(detector, records, np.full((len(records), 1), noise), limits, fraction, PULSE)
+    return find_echoes(detector, records, noise, limits, fraction, PULSE)
+
+
+def find_echoes(detector, records, noise, limits, fraction, pulse):
+    noise = np.full((len(records), 1), noise)
+    return _find_echoes(detector, records, noise, _levels(records, noise, limits), fraction, pulse)
 
 
 # -- detectors ---------------------------------------------------------------------------------------------
@@ -66,7 +71,7 @@ def test_times_of_skewed_and_of_short_pulses_have_no_walk_with_the_phase(detecto
     times = 30.0 + np.arange(32) / 32.0
     edges = np.arange(121.0) - 0.5
     records = np.stack([np.diff(np.asarray(pulse.cumulative(edges - t, 0.0), float)) for t in times])
-    echoes = _find_echoes(detector, records, np.zeros((32, 1)), None, 0.5, sampled_pulse(lidar))
+    echoes = find_echoes(detector, records, 0.0, None, 0.5, sampled_pulse(lidar))
     assert echoes.row.tolist() == list(range(32))
     np.testing.assert_allclose(echoes.time, times, atol=0.015)
     assert abs(np.mean(echoes.time - times)) < 1e-3
@@ -79,9 +84,7 @@ def test_a_flat_top_is_read_at_its_middle():
     records = np.stack([np.diff(np.asarray(pulse.cumulative(edges - t, 0.0), float)) for t in times])
     for factor in (fall, fall[::-1]):
         record = (records * factor).astype(np.float32)
-        echoes = _find_echoes(
-            "peak", record, np.zeros((32, 1)), None, 0.5, sampled_pulse(jl.Lidar(pulse=pulse))
-        )
+        echoes = find_echoes("peak", record, 0.0, None, 0.5, sampled_pulse(jl.Lidar(pulse=pulse)))
         assert echoes.row.tolist() == list(range(32))
         np.testing.assert_allclose(echoes.time, times, atol=0.5)
         assert abs(np.mean(echoes.time - times)) < 0.05

@@ -254,7 +254,7 @@ def test_cramer_rao_bounds_and_profile_likelihoods_need_a_strength():
 
 def test_inadmissible_arguments_of_bands_and_kernels_are_refused():
     fit = fitted(np.zeros(SAMPLES), SMOOTH)
-    with pytest.raises(ValueError, match="name = 'y'; admissible are 'x', 'b'"):
+    with pytest.raises(ValueError, match="name = 'y'; admissible are 'b', 'x'"):
         fit.band("y", 0.9)
     with pytest.raises(ValueError, match="level = 1"):
         fit.band("x", 1.0)
