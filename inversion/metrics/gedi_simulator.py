@@ -99,31 +99,14 @@ def simulator_table(
     **Arguments:** `shots`: of level 1B, simulated or recorded. `footprint_std`: standard deviation of the
     footprint in m. `progress`: is called with a `Progress` after every few shots. Default None.
 
-    **Returns:** a `ShotTable`, a row for each shot; NaN where nothing exceeds the noise. Its columns are
-    `shot_number` and
+    **Returns:** a `ShotTable`, a row for each shot, with `shot_number` and the columns of `_COLUMNS`, of
+    which `rhGauss`, `rhMax` and `rhInfl` are (shots, 101); NaN where nothing exceeds the noise.
 
-    - `gHeight`: ground in m, the centre of the lowest Gaussian with 0.1 % of the energy or more, of a sum of
-      Gaussians fitted to the record, which is smoothed by 0.57 m first where it has noise. One starts between
-      neighbouring inflection points of the record smoothed by 1.2 m. In some records with noise the lowest
-      Gaussian is a ripple up to some metres below the ground.
-    - `maxGround`: ground in m, the lowest maximum of the record smoothed by 0.57 m.
-    - `inflGround`: ground in m, the centre of gravity between the lowest two inflection points of that.
-    - `signal top`, `signal bottom`: elevation in m of the first and the last sample above 0.001 of the energy
-      per m.
-    - `cover`: one less the fraction of the Gaussians' energy in that of the ground.
-    - `leading edge ext`, `trailing edge extent`: m from the signal's top, or its bottom, to the first sample
-      that is at least the mean of the signal.
-    - `rhGauss`, `rhMax`, `rhInfl`: (shots, 101) elevations in m up to which 0 to 100 % of the energy lie,
-      above `gHeight`, `maxGround` and `inflGround`.
-    - `gaussHalfCov`, `maxHalfCov`, `infHalfCov`: cover E_c / (E_c + 1.425 E_g), with E_g twice the energy
-      below each ground, E_c the rest, and 1.425 the reflectance of plants over that of the ground.
-    - `waveEnergy`: energy in counts m.
-    - `blairSense`: cover through which the ground is detected with the probability 0.9, by the record's noise
-      (see the module's docstring): 1 - (n_n + n_s) sigma sqrt(2 pi) s / E; NaN for a record without noise.
-    - `FHD`: foliage height diversity -sum p ln p of the samples' fractions p of the energy.
-    - `niM2`, `niM2.1`: mean of the height above `gHeight` to the power of 2, or 2.1, weighted by the energy;
-      negative below the ground.
-    - `gSlope`: slope in degrees that would widen the pulse as the ground's Gaussian is wide.
+    `gHeight` is that of a sum of Gaussians fitted to the record, which is smoothed by 0.57 m first where it
+    has noise. One starts between neighbouring inflection points of the record smoothed by 1.2 m. In some
+    records with noise the lowest Gaussian is a ripple up to some metres below the ground. The covers by half
+    of an echo are E_c / (E_c + 1.425 E_g), with E_g twice the energy below each ground, E_c the rest, and
+    1.425 the reflectance of plants over that of the ground.
     """
     rows, start_time = [], time.perf_counter()
     for shot in shots:
@@ -144,26 +127,28 @@ def simulator_table(
 # Columns: unit and description.
 _RELATIVE_HEIGHTS = ("rhGauss", "rhMax", "rhInfl")
 _COLUMNS = {
-    "gHeight": ("m", "elevation of the lowest Gaussian"),
-    "maxGround": ("m", "elevation of the lowest maximum"),
-    "inflGround": ("m", "elevation between the lowest two inflection points"),
-    "signal top": ("m", "elevation of the first sample of the signal"),
-    "signal bottom": ("m", "elevation of the last sample of the signal"),
-    "cover": ("", "one less the fraction of energy in the lowest Gaussian"),
-    "leading edge ext": ("m", "from the signal's top to the first sample of its mean"),
-    "trailing edge extent": ("m", "from the signal's bottom to the first sample of its mean"),
-    "rhGauss": ("m", "relative height above gHeight"),
-    "rhMax": ("m", "relative height above maxGround"),
-    "rhInfl": ("m", "relative height above inflGround"),
+    "gHeight": ("m", "ground: centre of the lowest Gaussian with 0.1 % of the energy or more"),
+    "maxGround": ("m", "ground: lowest maximum of the record smoothed by 0.57 m"),
+    "inflGround": ("m", "ground: centre of gravity between the lowest two inflection points of that"),
+    "signal top": ("m", "elevation of the first sample above 0.001 of the energy per m"),
+    "signal bottom": ("m", "elevation of the last sample above 0.001 of the energy per m"),
+    "cover": ("", "one less the fraction of the Gaussians' energy in that of the ground"),
+    "leading edge ext": ("m", "from the signal's top to the first sample that is its mean or more"),
+    "trailing edge extent": ("m", "from the signal's bottom to the first sample that is its mean or more"),
+    "rhGauss": ("m", "elevation up to which 0 to 100 % of the energy lie, above gHeight"),
+    "rhMax": ("m", "elevation up to which 0 to 100 % of the energy lie, above maxGround"),
+    "rhInfl": ("m", "elevation up to which 0 to 100 % of the energy lie, above inflGround"),
     "gaussHalfCov": ("", "cover, with twice the energy below gHeight as that of the ground"),
     "maxHalfCov": ("", "cover, with twice the energy below maxGround as that of the ground"),
     "infHalfCov": ("", "cover, with twice the energy below inflGround as that of the ground"),
     "waveEnergy": ("counts m", "energy"),
-    "blairSense": ("", "cover through which the ground is detected"),
-    "FHD": ("", "foliage height diversity"),
-    "niM2": ("m2", "mean height squared, weighted by the energy"),
-    "niM2.1": ("m2.1", "mean height to the power of 2.1, weighted by the energy"),
-    "gSlope": ("degrees", "slope of the ground by the width of its Gaussian"),
+    # 1 - (n_n + n_s) sigma sqrt(2 pi) s / E of the module's docstring; NaN for a record without noise.
+    "blairSense": ("", "cover through which the ground is detected with the probability 0.9, by the noise"),
+    "FHD": ("", "foliage height diversity, -sum p ln p of the samples' fractions p of the energy"),
+    # Negative below the ground.
+    "niM2": ("m2", "mean of the height above gHeight squared, weighted by the energy"),
+    "niM2.1": ("m2.1", "mean of the height above gHeight to the power of 2.1, weighted by the energy"),
+    "gSlope": ("degrees", "slope that would widen the pulse as the ground's Gaussian is wide"),
 }
 
 
