@@ -250,6 +250,7 @@ class SimulationInputs(eqx.Module):
         lidar = set_lidar_values(self.lidar, self.setters, values)
         scene = set_values(self.scene, self.setters, values)
         if self.voxel_counts is not None:
+            assert scene.canopy is not None
             voxels = dataclasses.replace(scene.canopy.voxels, _counts=self.voxel_counts)
             scene = eqx.tree_at(lambda s: s.canopy.voxels, scene, voxels)
         return lidar, scene

@@ -203,7 +203,7 @@ def compare(
         if classes is not None:
             for label in np.unique(pair.group):
                 of_class = pair.group == label
-                members = ComparedColumn(*(a[of_class] for a in pair[:4]))
+                members = ComparedColumn(*(a[of_class] for a in pair[:4]), unit=pair.unit)
                 statistics.append(_statistics(name, str(label), members, sigmas))
     return Comparison(tuple(statistics), pairs, float(sigmas))
 
@@ -215,7 +215,7 @@ def _statistics(name: str, group: str, pair: ComparedColumn, sigmas: float) -> C
         return ComparisonStatistics(name, group, 0, *[float("nan")] * 6)
     rank = np.nan
     if difference.size >= _MIN_RANKED and np.ptp(pair.estimate) > 0 and np.ptp(pair.reference) > 0:
-        rank = scipy.stats.spearmanr(pair.estimate, pair.reference).statistic
+        rank = float(scipy.stats.spearmanr(pair.estimate, pair.reference).statistic)
     has_error = np.isfinite(pair.stderr)
     is_covered = np.abs(difference) <= sigmas * pair.stderr
     return ComparisonStatistics(

@@ -178,7 +178,9 @@ def with_room(voxels: VoxelMap) -> VoxelMap:
     """Return the map, or stack of maps, with tables of a size bucket, which maps of several shapes share."""
     if voxels._counts is not None:
         return voxels
-    *stack, nx, ny, nz = (voxels.bark if voxels.leaf is None else voxels.leaf).shape
+    extinction = voxels.bark if voxels.leaf is None else voxels.leaf
+    assert extinction is not None
+    *stack, nx, ny, nz = extinction.shape
     room = [(0, 0)] * len(stack) + [(0, n - m) for n, m in zip(_padded_shape((nx, ny, nz)), (nx, ny, nz))]
 
     def padded(table: Array | np.ndarray | None) -> Array | np.ndarray | None:
