@@ -10,7 +10,8 @@ import pytest
 
 import jaxlidar as jl
 from jaxlidar.simulation.reflectance import _is_same_direction
-from tests.helpers import slow_unless
+from jaxlidar.trace.photons import higher_orders
+from tests.helpers import agrees, slow_unless
 
 KEY = jax.random.key(0)
 THICKNESS = 10.0
@@ -178,6 +179,54 @@ def test_derivatives_are_those_of_finite_differences():
         change = step * jnp.eye(3)[i]
         difference = (factor(values + change)[0] - factor(values - change)[0]) / (2 * step)
         assert float(slopes[i]) == pytest.approx(float(difference), rel=tolerance, abs=2e-3)
+
+
+def factor_of_ridges(heights, half_width, sun, view):
+    """Return the reflectance factor of ridges along y, of nodes 1 m apart, in view over |x| < half_width.
+
+    Sun and sensor stand in the vertical plane across the ridges, and no slope hides another one. A node is
+    seen through the point of the reference plane that lies beside it by its height times the tangent of the
+    view's zenith angle. Slopes return the cosine of incidence over that of the sun's zenith angle.
+    """
+    nodes = np.arange(len(heights)) - 0.5 * (len(heights) - 1)
+    edges = np.clip(nodes - np.tan(np.deg2rad(view)) * heights, -half_width, half_width)
+    slopes, tangent = np.diff(heights), np.tan(np.deg2rad(sun))
+    returned = (1.0 - slopes * tangent) / np.sqrt(1.0 + slopes**2)
+    return np.sum(np.diff(edges) * returned) / (2.0 * half_width)
+
+
+@pytest.mark.slow
+def test_derivatives_by_the_relief_of_terrain_are_those_of_the_closed_form(monkeypatch):
+    """Off nadir, light lands on other slopes as the relief grows. Planted: rays that keep their places."""
+    relief = np.cumsum(np.random.default_rng(1).uniform(-0.25, 0.25, 25))
+    relief -= relief.mean()
+    options = {"sun": (40.0, 90.0), "view": (25.0, 90.0), "wavelengths": 865.0, "area": ((-8, -8), (8, 8))}
+
+    def scene_of(scale):
+        heights = jnp.broadcast_to(scale * jnp.asarray(relief)[:, None], (25, 25))
+        return jl.Scene(ground=jl.Terrain(heights, spacing=1.0, origin=(-12.0, -12.0), reflectance=1.0))
+
+    plan = jl.plan_reflectance(scene_of(1.1), n_photons=1 << 15, max_orders=1, **options)
+
+    def estimate():
+        def factor(scale, key):
+            return jl.reflectance_factor(scene_of(scale), plan=plan, key=key, **options).reflectance[0]
+
+        program = jax.jit(lambda key: jax.jvp(lambda scale: factor(scale, key), (1.0,), (1.0,)))
+        values = np.array([program(key) for key in jax.random.split(jax.random.key(3), 24)])
+        return values.mean(axis=0), values.std(axis=0, ddof=1) / np.sqrt(len(values))
+
+    step, angles = 1e-5, (8.0, 40.0, 25.0)
+    high, low = (factor_of_ridges((1.0 + s) * relief, *angles) for s in (step, -step))
+    expected = np.array([factor_of_ridges(relief, *angles), (high - low) / (2.0 * step)])
+    mean, stderr = estimate()
+    assert agrees(mean, stderr, expected, sigmas=4.0)
+    assert stderr[1] < 0.01 * abs(expected[1])
+
+    monkeypatch.setattr(higher_orders, "rays_with_grids", lambda scene, x: (x, jnp.ones_like(x[0])))
+    fixed, _ = estimate()
+    assert agrees(fixed[0], stderr[0], expected[0], sigmas=4.0)
+    assert not agrees(fixed[1], stderr[1], expected[1], sigmas=10.0)
 
 
 def test_inadmissible_arguments_are_refused():

@@ -233,9 +233,13 @@ def has_moving_rays(scene: DeviceScene) -> bool:
     Over planes alone, where a quadrature rule takes their place, nothing jumps. Rays of a lidar that is
     placed by its sensor, which may be level, keep a place on terrain alone.
     """
+    if scene.derivatives == "none":
+        return False
+    if scene.beam.rectangle is not None:
+        return True
     may_jump = scene.config.n_rays > 1 and not scene.config.uses_quadrature
     has_place = not scene.beam.from_sensor or _terrain(scene) is not None
-    return scene.derivatives != "none" and may_jump and has_place
+    return may_jump and has_place
 
 
 def rays_with_grids(
@@ -245,8 +249,9 @@ def rays_with_grids(
 
     1. Rays of a Gaussian beam move with grids and terrain (`move_across_beam`). The beam itself does not
        move them: the ratio of its irradiance makes up for a change of its width, and for their motion.
-    2. The rim of a top-hat beam would not make up for it. Rays widen with the beam, and stay within its rim;
-       away from the rim they move with grids and terrain.
+    2. The rim of a top-hat beam would not make up for it, nor would the sides of a rectangle. Rays widen with
+       the beam, or move with the rectangle, and stay within its rim; away from the rim they move with grids
+       and terrain.
     3. Where shapes state outlines, the motion is blended with that of these.
     4. Rays of a lidar that is placed by its sensor stay where they are unless all of them meet terrain.
 
@@ -254,8 +259,7 @@ def rays_with_grids(
     changed.
     """
     one = jnp.ones_like(across[0])
-    # Light over a rectangle has no profile that could make up for a motion; the rectangle moves with the map.
-    if not has_moving_rays(scene) or scene.beam.rectangle is not None:
+    if not has_moving_rays(scene):
         return across, one
     beam, outlines = scene.beam, _surfaces_with_outline(scene, across)
     if not (beam.gaussian or outlines or _grids(scene)):
@@ -265,7 +269,7 @@ def rays_with_grids(
         moved, area = _with_rim_and_outlines(scene, outlines, across, (moved, area))
     density = beam.irradiance(moved) * area if beam.gaussian else area
     # A beam without width has no profile that could make up for the motion.
-    may_move = beam.radius > _MIN_RADIUS
+    may_move = jnp.asarray(True) if beam.rectangle is not None else beam.radius > _MIN_RADIUS
     if beam.from_sensor:
         may_move &= jnp.all(is_met)
     density = jnp.where(may_move, density, 1.0)
@@ -304,21 +308,32 @@ def _with_rim_and_outlines(
     across: tuple[Scalar, Scalar],
     moved_with_grids: tuple[tuple[Scalar, Scalar], Scalar],
 ) -> tuple[tuple[Scalar, Scalar], Scalar]:
-    """Blend the motion of points across the beam with that of the rim of a top-hat beam and of outlines.
+    """Blend the motion of points across the beam with that of outlines, and of the rim of an even beam.
 
     `moved_with_grids`: points and |dT/du| of `move_across_beam`.
 
-    **Returns:** points across the beam, and |dT/du|, for a top-hat beam over that of its widening.
+    **Returns:** points across the beam, and |dT/du|, for an even beam over that of its own motion.
     """
-    radius = jnp.maximum(detach(scene.beam.radius), _MIN_RADIUS)
-    start, reach = jax.tree.map(detach, across), _OUTLINE_REACH * radius
     fixed_scene = jax.tree.map(detach, scene)
     (moved, area), beam, fixed_beam = moved_with_grids, scene.beam, fixed_scene.beam
-    # Points of a top-hat beam, which is round, widen with it, and motions are relative to that.
-    widening = jnp.ones_like(radius) if beam.gaussian else beam.radius / radius
+    own, start = _motion_of_beam(beam), jax.tree.map(detach, across)
+    if fixed_beam.rectangle is None:
+        radius = jnp.maximum(fixed_beam.radius, _MIN_RADIUS)
+    else:
+        radius = 0.5 * jnp.min(fixed_beam.rectangle[1])
+    reach = _OUTLINE_REACH * radius
+    if fixed_beam.rectangle is not None:
+        # Where cells are many times finer, their faces would outweigh the rim, whose weight is bounded.
+        reach = jnp.min(jnp.stack([reach, *(jnp.min(width) for width, _ in _grids(fixed_scene))]))
 
     def to_rim(u: tuple[Scalar, Scalar]) -> Scalar:
-        return 1.0 + _inverse_square(radius - jnp.sqrt(jnp.maximum(u[0] ** 2 + u[1] ** 2, 1e-12)), reach)
+        if fixed_beam.rectangle is None:
+            distances = [radius - jnp.sqrt(jnp.maximum(u[0] ** 2 + u[1] ** 2, 1e-12))]
+        else:
+            corner, size = fixed_beam.rectangle
+            from_corner = [u[k] - corner[k] for k in range(2)]
+            distances = from_corner + [size[k] - from_corner[k] for k in range(2)]
+        return sum((_inverse_square(distance, reach) for distance in distances), jnp.ones_like(u[0]))
 
     def to_faces(u: tuple[Scalar, Scalar]) -> Scalar:
         landing, _ = _landing(fixed_scene, u)
@@ -329,19 +344,18 @@ def _with_rim_and_outlines(
         weight = sum((_inverse_square(distance, reach) for distance in distances), jnp.zeros_like(u[0]))
         return weight + 1.0 if beam.gaussian else weight
 
-    base, motions = (widening * start[0], widening * start[1]), []
+    base, motions = own.point(start), []
     if not beam.gaussian:
         still = jnp.zeros_like(start[0])
         motions.append(_Motion((still, still), still, *_value_and_slopes(to_rim, start)))
     if beam.gaussian or _grids(scene):
         displacement = (moved[0] - base[0], moved[1] - base[1])
-        divergence = area / detach(area) - widening * widening
+        divergence = area / detach(area) - own.area
         motions.append(_Motion(displacement, divergence, *_value_and_slopes(to_faces, start)))
     for surface, fixed in zip(outlines, jax.tree.map(detach, outlines)):
 
         def distance(u: tuple[Scalar, Scalar], surface: TracedSurface = surface) -> Scalar:
-            u = (widening * u[0], widening * u[1])
-            return _distance_from_outline(beam, surface, scene.limits.start_distance, u)
+            return _distance_from_outline(beam, surface, scene.limits.start_distance, own.point(u))
 
         def fixed_distance(u: tuple[Scalar, Scalar], surface: TracedSurface = fixed) -> Scalar:
             return _distance_from_outline(fixed_beam, surface, fixed_scene.limits.start_distance, u)
@@ -349,6 +363,39 @@ def _with_rim_and_outlines(
         motions.append(_outline_motion(distance, fixed_distance, start, reach))
     (x, y), divergence = _blend(motions)
     return (base[0] + x, base[1] + y), 1.0 + divergence
+
+
+class _MotionOfBeam(NamedTuple):
+    """The motion of points with an even beam: with their fractions of its width held fixed.
+
+    Identity in value: (stretch x + shift) along each axis. That of a Gaussian beam is zero.
+    """
+
+    stretch: tuple[Scalar, Scalar]
+    shift: tuple[Scalar, Scalar]
+
+    def point(self, u: tuple[Scalar, Scalar]) -> tuple[Scalar, Scalar]:
+        """Return where a point moves to."""
+        x, y = (a * b + c for a, b, c in zip(self.stretch, u, self.shift))
+        return x, y
+
+    @property
+    def area(self) -> Scalar:
+        """|dT/du|."""
+        return self.stretch[0] * self.stretch[1]
+
+
+def _motion_of_beam(beam: Beam) -> _MotionOfBeam:
+    """Return the motion of points with the width of a top-hat beam, or with a rectangle."""
+    if beam.rectangle is not None:
+        corner, size = beam.rectangle
+        stretch = size / jnp.maximum(detach(size), _MIN_RADIUS)
+        shift = corner - stretch * detach(corner)
+        return _MotionOfBeam((stretch[0], stretch[1]), (shift[0], shift[1]))
+    # A top-hat beam is round.
+    zero = jnp.zeros_like(beam.radius)
+    widening = zero + 1.0 if beam.gaussian else beam.radius / jnp.maximum(detach(beam.radius), _MIN_RADIUS)
+    return _MotionOfBeam((widening, widening), (zero, zero))
 
 
 def _distance_from_outline(
@@ -437,7 +484,8 @@ def move_across_beam(
 
     1. Where the ray meets the terrain, or else the reference plane, detached.
     2. The same place between the faces of all grids, and as high as the terrain is there now.
-    3. Its central projection from the sensor onto the plane across the beam.
+    3. Its central projection from the sensor onto the plane across the beam; of parallel light, its
+       projection along the axis onto the reference plane.
     4. |dT/du|, up to a constant: the area between faces, projected onto that plane.
 
     **Returns:** points across the beam, |dT/du|, and True for rays that meet terrain.
@@ -449,6 +497,11 @@ def move_across_beam(
     if terrain is not None:
         value, slopes = terrain.heights.value_and_slope((x, y))
         height, slope_x, slope_y = (jnp.where(is_met, a, 0.0) for a in (value, *slopes))
+    if beam.parallel:
+        # Points lie on the reference plane, along the axis from the surface.
+        east, north, up = beam.axis
+        cosine = jnp.abs((up - slope_x * east - slope_y * north) / up)
+        return (x - height * east / up, y - height * north / up), widths[0] * widths[1] * cosine, is_met
     in_beam = to_frame(beam.axis, (x, y, height))
     # Central projection from the sensor onto the plane across the beam.
     magnification = beam.slant_range / (beam.slant_range + in_beam[2])
