@@ -156,3 +156,31 @@ def test_layers_are_retrieved():
         n_rays=1024,
     )
     np.testing.assert_allclose(fit.values["layers"], np.linspace(0.7, 1.3, LAYERS), atol=0.05)
+
+
+def put_top(scene, extinction):
+    return eqx.tree_at(
+        lambda s: s.canopy.voxels.leaf, scene, replace_fn=lambda leaf: leaf.at[..., 3:].set(extinction)
+    )
+
+
+@pytest.mark.slow
+def test_leaves_above_the_occupied_voxels_would_attenuate():
+    """Black leaves in empty layers and in layers of next to no leaf: the same paths, and the same derivative.
+
+    Planted: a derivative that is 2 % off.
+    """
+    leaf = jnp.zeros((1, 1, 6)).at[..., :3].set(0.1)
+    voxels = jl.VoxelMap.from_extinction(leaf=leaf, voxel_size=(40.0, 40.0, 1.0), origin=(-20.0, -20.0, 3.0))
+    plate = jl.Plate(height=2.0, reflectance=0.6, transmittance=0.3)
+    scene = jl.Scene(
+        canopy=jl.Canopy(voxels, leaf=jl.LeafOptics(1e-6), sides="periodic"),
+        plates=(plate,),
+        ground=jl.Ground(reflectance=0.9),
+    )
+    top = inversion.Unknown(apply=put_top, name="top", bounds=(0.0, 0.5), start=0.1)
+    model, _ = model_of(scene, [top], lidar=jl.Lidar(divergence=0.5), orders=4)
+    assert dependences(model) == ["extinction"]
+    in_empty, in_thin = (model(np.array([value])).jacobian[..., 0].sum() for value in (0.0, 1e-6))
+    assert in_empty == pytest.approx(in_thin, rel=1e-4)
+    assert 0.98 * in_empty != pytest.approx(in_thin, rel=1e-4)
