@@ -294,9 +294,7 @@ def _trace_with_slopes(
     setup: Setup, slopes: ExtinctionSlopes, key: PRNGKeyArray
 ) -> tuple[Response, Float[Array, "columns wavelengths bins"]]:
     """Trace one batch. Return its response, and the derivatives of its reflectance by scores."""
-    device_scene = build_device_scene(setup, derivatives="forward")
-    # Not only the box of occupied voxels: leaves in empty voxels around it would attenuate, too.
-    device_scene = dataclasses.replace(device_scene, slopes=slopes, occupied_box=None)
+    device_scene = dataclasses.replace(build_device_scene(setup, derivatives="forward"), slopes=slopes)
     response, fine_columns = trace_with_scores(device_scene, setup_optics(setup), key)
     return response, derivatives_to_samples(fine_columns, make_waveform_model(setup))
 

@@ -66,7 +66,8 @@ class DeviceScene(eqx.Module):
       these.
     - `depth_above`: optical depth straight up from every voxel's upper face, for photons of a beam at nadir;
       else None.
-    - `occupied_box`: the block of the grid that holds all voxels with any extinction.
+    - `occupied_box`: the block of the grid that holds all voxels with any extinction; None where derivatives
+      in forward mode see all of the grid.
 
     The plan:
 
@@ -214,7 +215,12 @@ def complete_device_scene(geometry: DeviceScene, setup: Setup, derivatives: Deri
     scene = eqx.tree_at(
         lambda s: (s.optics, s.straight_transmittance), geometry, fields, is_leaf=lambda x: x is None
     )
-    return scene if derivatives == "none" else dataclasses.replace(scene, derivatives=derivatives)
+    if derivatives == "none":
+        return scene
+    # Leaves in empty voxels around the occupied ones would attenuate flights, too. Reverse mode replays these
+    # without the box (`trace.derivatives.replay`).
+    box = scene.occupied_box if derivatives == "all" else None
+    return dataclasses.replace(scene, derivatives=derivatives, occupied_box=box)
 
 
 def _without_spectrum(lidar: Lidar) -> Lidar:

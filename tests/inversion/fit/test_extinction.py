@@ -165,8 +165,11 @@ def put_top(scene, extinction):
 
 
 @pytest.mark.slow
-def test_leaves_above_the_occupied_voxels_would_attenuate():
+@pytest.mark.parametrize(("zenith", "method"), [(0.0, "extinction"), (10.0, "geometric")])
+def test_leaves_above_the_occupied_voxels_would_attenuate(zenith, method):
     """Black leaves in empty layers and in layers of next to no leaf: the same paths, and the same derivative.
+
+    Straight down by score functions, and else by tangents.
 
     Planted: a derivative that is 2 % off.
     """
@@ -179,8 +182,8 @@ def test_leaves_above_the_occupied_voxels_would_attenuate():
         ground=jl.Ground(reflectance=0.9),
     )
     top = inversion.Unknown(apply=put_top, name="top", bounds=(0.0, 0.5), start=0.1)
-    model, _ = model_of(scene, [top], lidar=jl.Lidar(divergence=0.5), orders=4)
-    assert dependences(model) == ["extinction"]
+    model, _ = model_of(scene, [top], lidar=jl.Lidar(divergence=0.5, zenith=zenith), orders=4)
+    assert dependences(model) == [method]
     in_empty, in_thin = (model(np.array([value])).jacobian[..., 0].sum() for value in (0.0, 1e-6))
     assert in_empty == pytest.approx(in_thin, rel=1e-4)
     assert 0.98 * in_empty != pytest.approx(in_thin, rel=1e-4)
