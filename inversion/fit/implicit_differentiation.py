@@ -285,7 +285,7 @@ def differentiable_retrieval(
         def simulated(inputs: FitInputs) -> Array:
             assert model is not None
             lidar = with_fixed_window(inputs.lidar)
-            simulation = SimulationInputs(lidar, inputs.scene, model.plan, model.setters, 0)
+            simulation = SimulationInputs(lidar, inputs.scene, model.plan, model.setters, 0).with_room()
             return _mean_reflectance(simulation, values_of(solved)[: len(model.setters)], model.keys)
 
         for derivative, function, names in (

@@ -231,6 +231,7 @@ class SimulationInputs(eqx.Module):
         extinction = extinction_arrays(self.scene)
         if any(s.apply is not None or (not s.of_lidar and s.array_index in extinction) for s in self.setters):
             return self
+        assert self.columns_per_voxel == 0
         voxels = with_room(self.scene.canopy.voxels)
         # The numbers of voxels join the scene after the values, whose setters count the arrays before them.
         tables = dataclasses.replace(voxels, _counts=None)

@@ -8,6 +8,7 @@ not all corners are examined (`corner_cases`).
 
 import dataclasses
 import itertools
+from collections.abc import Sequence
 from typing import Any
 
 import jax.numpy as jnp
@@ -59,6 +60,10 @@ def size_arguments(
     return {"n_photons": N_BATCHES * -(-photons // N_BATCHES), "n_rays": rays, "max_orders": max_orders}
 
 
+# Lidar, scene and unknowns of a record.
+FitCase = tuple[Lidar, Scene, list[BoundUnknown]]
+
+
 def corner_cases(lidar: Lidar, scene: Scene, unknowns: list[BoundUnknown]) -> list[tuple[Lidar, Scene]]:
     """Return lidar and scene at their start, and with the unknowns that plans depend on at their bounds.
 
@@ -93,13 +98,14 @@ def plan_for_bounds(
     unknowns: list[BoundUnknown],
     time: Float[np.ndarray, " samples"],
     *,
+    others: Sequence[FitCase] = (),
     max_orders: int | None,
     **sizes: int,
 ) -> Plan:
     """Plan the starting scene, with loops and fine time bins long enough for all `corner_cases`.
 
     Fine time bins are those in which light is collected; `time` has the samples of the record. With
-    a `Survey` the plan serves all of its shots.
+    a `Survey` the plan serves all of its shots. `others`: of further records that it serves.
 
     Orders, and whether histories are kept, are those of the starting scene.
 
@@ -109,7 +115,7 @@ def plan_for_bounds(
     interval = float(lidar.sampling_interval)
     # A thousandth of a sample keeps the last one in a window whose end is rounded.
     window = (float(time[0]), float(time[0]) + (time.size - 1 + 1e-3) * interval)
-    cases = corner_cases(lidar, scene, unknowns)
+    cases = [case for start in ((lidar, scene, unknowns), *others) for case in corner_cases(*start)]
     common: dict[str, Any] = {
         "window": window,
         **sizes,
@@ -154,6 +160,7 @@ def checked_plan(
     unknowns: list[BoundUnknown],
     time: Float[np.ndarray, " samples"],
     sizes: dict[str, Any],
+    others: Sequence[FitCase] = (),
 ) -> Plan:
     """Check a plan for the samples and for all `corner_cases`, or make one with `plan_for_bounds`.
 
@@ -163,13 +170,14 @@ def checked_plan(
     `plan_for_bounds`.
     """
     if plan is None:
-        plan = plan_for_bounds(lidar, scene, unknowns, time, **sizes)
+        plan = plan_for_bounds(lidar, scene, unknowns, time, others=others, **sizes)
         check_samples(plan, time)
         return plan
     check_samples(plan, time)
     moves_lidar = any(u.setter.of_lidar for u in unknowns)
     # The first case is the start itself.
-    for number, corner in enumerate(corner_cases(lidar, scene, unknowns)):
+    starts = ((lidar, scene, unknowns), *others)
+    for number, corner in ((n, corner) for start in starts for n, corner in enumerate(corner_cases(*start))):
         try:
             check_reach(plan, *corner)
             if moves_lidar:

@@ -260,8 +260,24 @@ def _bind(problem: Problem) -> BoundProblem:
             for i, record in enumerate(records)
         ]
         # One plan, and one compiled program, serve all.
-        plan = checked_plan(problem.plan, *place, observed[0].time, sizes)
+        records_of_extremes = sorted({*_extremes(lidars), *_extremes(scenes)} - {0})
+        others = [
+            (_of_record(lidars, i), _of_record(scenes, i), _of_record(unknowns, i))
+            for i in records_of_extremes
+        ]
+        plan = checked_plan(problem.plan, *place, observed[0].time, sizes, others)
     return BoundProblem(range(len(observed)), observed, lidars, scenes, unknowns, scale, recorders, plan)
+
+
+def _extremes(objects: Sequence[Any]) -> set[int]:
+    """Return the indices of lidars or scenes that have the least or the largest values of any array."""
+    indices = set()
+    for arrays in zip(*(jax.tree.leaves(a) for a in objects)):
+        for extreme in (np.min, np.max):
+            values = [float(extreme(np.asarray(a))) for a in arrays if np.size(a)]
+            if values and min(values) < max(values):
+                indices |= {int(np.argmin(values)), int(np.argmax(values))}
+    return indices
 
 
 def _with_starts(

@@ -371,8 +371,8 @@ def _evaluate_in_lockstep(
 
     def evaluate(member: tuple) -> tuple[Array, Array, Array]:
         arrays, values, n_batches = member
-        own_inputs = dataclasses.replace(inputs, **eqx.combine(arrays, static))
-        return evaluate_scene(own_inputs, values, keys, n_batches)
+        member_inputs = dataclasses.replace(inputs, **eqx.combine(arrays, static))
+        return evaluate_scene(member_inputs, values, keys, n_batches)
 
     members = stacked_arrays, values, n_batches
     # At first order there are no photons, and all members take equally long.

@@ -63,6 +63,9 @@ def match_columns(
         matches = [
             Column(i, names[i].strip(), unit) for i, (name, unit) in enumerate(plain) if name in admissible
         ]
+        # A column again in another unit is not needed.
+        without_unit = [column for column in matches if column.unit is None]
+        matches = without_unit if len(without_unit) == 1 else matches
         if len(matches) > 1:
             raise ValueError(
                 f"{location}: {quantity} may be any of the columns "

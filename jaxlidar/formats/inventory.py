@@ -41,4 +41,4 @@ def read_inventory(path: str | os.PathLike[str], *, crs: str | int | None = None
     cells = dict(rows)
     columns = list(zip(*cells.values())) or [()] * len(names)
     places = [f"{path}: line {number}" for number in cells]
-    return inventory_of_columns(f"{path}: line 1", names, columns, places)._replace(crs=system)
+    return inventory_of_columns(f"{path}: line 1", names, columns.__getitem__, places)._replace(crs=system)

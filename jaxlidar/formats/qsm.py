@@ -163,6 +163,9 @@ class _Cylinder(NamedTuple):
 def _columns(path: Path, names: list[str]) -> dict[str, Column]:
     """Return each column in use: that of its first name which the table has. Orders may be missing."""
     plain, units = zip(*map(name_and_unit, names))
+    # A column again in another unit is not needed.
+    bare = {name for name, unit in zip(plain, units) if unit is None}
+    plain = ["" if unit is not None and name in bare else name for name, unit in zip(plain, units)]
     columns = {}
     for column, known in _COLUMNS.items():
         present = [name for name in known if name in plain]

@@ -63,13 +63,13 @@ def read_trajectory(path: str | os.PathLike[str], *, crs: str | None = None) -> 
 
     **Arguments:**
 
-    - `path`: a text file of comma-, semicolon-, tab- or space-separated values. Its first line that does not
-      open with "#", or else the last one that does, names the columns, in any order and case, with spaces or
-      underscores, and with a unit in brackets where it is not the usual one: GPS time in s, as time, GPSTime
-      or SOW; x or easting, y or northing, and z, height or altitude in m; roll, pitch, and yaw or heading in
-      degrees. Comments such as "# units: feet" and "# crs: EPSG:2263" name the unit of lengths without one.
-      Further columns are not read; a `UserWarning` names those that nearly have the name of one that is
-      missing. Without roll and pitch these are zero; without yaw the platform
+    - `path`: a text file of comma-, semicolon-, tab- or space-separated values. Its first line that does
+      not open with "#", or else the last one that does, names the columns, in any order and case, with
+      spaces or underscores, and with a unit, as in `x [ft]` or `x_ft`, where it is not the usual one: GPS
+      time in s, as time, GPSTime or SOW; x or easting, y or northing, and z, height or altitude in m; roll,
+      pitch, and yaw or heading in degrees. Comments such as "# units: feet" and "# crs: EPSG:2263" name the
+      unit of lengths without one. Further columns are not read; a `UserWarning` names those that nearly
+      have the name of one that is missing. Without roll and pitch these are zero; without yaw the platform
       heads along its course.
     - `crs`: a map's coordinate reference system in metres, such as "EPSG:32633". Columns longitude and
       latitude, on WGS 84, are projected to it, and headings, which are from true north, turned to the map's;

@@ -1,6 +1,6 @@
 """Stands from forest inventories: tables with a row for each tree."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -133,7 +133,7 @@ def stand_from_inventory(
         )
     names = list(table.keys())
     trees = inventory_of_columns(
-        "the inventory", [str(name) for name in names], [list(table[name]) for name in names]
+        "the inventory", [str(name) for name in names], lambda i: list(table[names[i]])
     )
     if (leaf_area_index is None) != (area is None):
         raise ValueError("leaf_area_index and area belong together: give both or neither")
@@ -203,17 +203,21 @@ def _habits_by_species(habits: Any, trees: Inventory) -> Mapping[str, Habit]:
 
 
 def inventory_of_columns(
-    location: str, names: Sequence[str], cells: Sequence[Sequence[Any]], places: Sequence[str] | None = None
+    location: str,
+    names: Sequence[str],
+    cells_of: Callable[[int], Sequence[Any]],
+    places: Sequence[str] | None = None,
 ) -> Inventory:
     """Return the inventory of a table, with lengths in m.
 
-    **Arguments:** `location`: the table, for messages. `names`, `cells`: of each column. `places`: of the
-    rows, for messages. Default None: "row 0" and so on.
+    **Arguments:** `location`: the table, for messages. `names`: of its columns. `cells_of`: returns the cells
+    of a column, by its index. `places`: of the rows, for messages. Default None: "row 0" and so on.
 
     **Raises:** ValueError as `stand_from_inventory`.
     """
     columns = match_columns(location, names, COLUMNS)
     check_columns(location, names, columns, COLUMNS, ("height",))
+    cells = {column.index: cells_of(column.index) for column in columns.values()}
     n = len(cells[columns["x"].index])
     for column in columns.values():
         if len(cells[column.index]) != n:

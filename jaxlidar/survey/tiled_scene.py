@@ -277,8 +277,8 @@ def trace_tile(
     light = ShotsInMemory(len(tile.shots))
     survey_results = SurveyResults(strategy, light, ShotsInMemory(0), {})
     # One after the other: the task of a tile has one core.
-    for part, (_, result) in zip(tasks, in_turn([part.unit for part in tasks])):
-        survey_results.add(part, result)
+    for survey_task, (_, result) in zip(tasks, in_turn([t.unit for t in tasks])):
+        survey_results.add(survey_task, result)
     survey_results.sum_contributions()
     results: dict[str, Any] = dict(light.values)
     fates = [f"absorbed by {material}" for material in options.materials]
@@ -300,7 +300,7 @@ def truth_of_tile(
 ) -> dict[str, Any]:
     """Return the fields of the truth of the shots of a tile, as `truths_of_chunk` does."""
     strategy = _strategy_of_tile(survey, scene, tile, options)
-    chunks = [chunk for _, chunk in in_turn([part.unit for part in truth_tasks(strategy, key)])]
+    chunks = [chunk for _, chunk in in_turn([t.unit for t in truth_tasks(strategy, key)])]
     truths = jax.tree.map(lambda *a: np.concatenate(a), *chunks)
     # The last chunk is as large as the others, and filled up.
     truths = jax.tree.map(lambda a: a[: len(tile.shots)], truths)

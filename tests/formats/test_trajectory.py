@@ -83,6 +83,12 @@ def test_times_that_are_not_gps_time_are_refused(tmp_path, column):
     assert jaxlidar.io.read_trajectory(written(tmp_path, table)).time.tolist() == [25.0, 26.0]
 
 
+def test_a_column_again_in_another_unit_is_not_read(tmp_path):
+    path = tmp_path / "track.csv"
+    path.write_text("time,x,y,z,z_ft\n0,1,2,3,9\n1,1,2,3,9\n")
+    np.testing.assert_allclose(jaxlidar.io.read_trajectory(path).position[:, 2], 3.0)
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [

@@ -115,6 +115,14 @@ def test_trees_stand_where_the_inventory_says_and_have_its_sizes():
     assert np.isclose(leaf_area(jl.voxelise(stand, 1.0)), 50.0, rtol=1e-4)
 
 
+def test_columns_that_are_not_read_may_be_anything():
+    """No lists, and heights again in another unit."""
+    more = {"plot": 7, "note": None, "height_ft": [3.0]}
+    stand, same = (jl.stand_from_inventory(table, SPECIES, individuals=1) for table in (TABLE, TABLE | more))
+    np.testing.assert_array_equal(same.position, stand.position)
+    assert [tree.height for tree in same] == [tree.height for tree in stand]
+
+
 class Frame:
     """A stand-in for a DataFrame: columns with an index of their own."""
 

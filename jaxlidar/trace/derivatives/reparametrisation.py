@@ -312,11 +312,11 @@ def _with_rim_and_outlines(
 
     `moved_with_grids`: points and |dT/du| of `move_across_beam`.
 
-    **Returns:** points across the beam, and |dT/du|, for an even beam over that of its own motion.
+    **Returns:** points across the beam, and |dT/du|, for an even beam over that of the motion of the beam.
     """
     fixed_scene = jax.tree.map(detach, scene)
     (moved, area), beam, fixed_beam = moved_with_grids, scene.beam, fixed_scene.beam
-    own, start = _motion_of_beam(beam), jax.tree.map(detach, across)
+    beam_motion, start = _motion_of_beam(beam), jax.tree.map(detach, across)
     if fixed_beam.rectangle is None:
         radius = jnp.maximum(fixed_beam.radius, _MIN_RADIUS)
     else:
@@ -344,18 +344,18 @@ def _with_rim_and_outlines(
         weight = sum((_inverse_square(distance, reach) for distance in distances), jnp.zeros_like(u[0]))
         return weight + 1.0 if beam.gaussian else weight
 
-    base, motions = own.point(start), []
+    base, motions = beam_motion.point(start), []
     if not beam.gaussian:
         still = jnp.zeros_like(start[0])
         motions.append(_Motion((still, still), still, *_value_and_slopes(to_rim, start)))
     if beam.gaussian or _grids(scene):
         displacement = (moved[0] - base[0], moved[1] - base[1])
-        divergence = area / detach(area) - own.area
+        divergence = area / detach(area) - beam_motion.area
         motions.append(_Motion(displacement, divergence, *_value_and_slopes(to_faces, start)))
     for surface, fixed in zip(outlines, jax.tree.map(detach, outlines)):
 
         def distance(u: tuple[Scalar, Scalar], surface: TracedSurface = surface) -> Scalar:
-            return _distance_from_outline(beam, surface, scene.limits.start_distance, own.point(u))
+            return _distance_from_outline(beam, surface, scene.limits.start_distance, beam_motion.point(u))
 
         def fixed_distance(u: tuple[Scalar, Scalar], surface: TracedSurface = fixed) -> Scalar:
             return _distance_from_outline(fixed_beam, surface, fixed_scene.limits.start_distance, u)

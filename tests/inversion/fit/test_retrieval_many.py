@@ -369,3 +369,21 @@ def test_arguments_of_the_wrong_type_are_refused():
         "TypeError an unknown: where = 3 is no path and no function",
         "TypeError unknown 'x': apply = 3 is no function",
     ]
+
+
+@pytest.mark.parametrize("n_scenes", [1, 2])
+def test_lidars_of_several_directions_share_a_plan(n_scenes):
+    """A plan for the first beam alone, at nadir, would bias the others: a height of 0.19 m."""
+    lidars = [jl.Lidar(zenith=zenith) for zenith in (0.0, 20.0, 10.0)]
+    truth = jl.Scene(ground=jl.Ground(height=0.2, reflectance=0.35))
+    start = jl.Scene(ground=jl.Ground(height=0.0, reflectance=0.5))
+    waves = [jl.simulate(lidar, truth, key=jax.random.key(0), window=(-40.0, 40.0)) for lidar in lidars]
+    observed = np.stack([wave.reflectance for wave in waves])
+    arguments = observed, lidars, start if n_scenes == 1 else [start] * 3, UNKNOWNS
+    options = {"noise": 1e-3, "time": waves[0].time}
+    many = ask(inversion.retrieve_many, *arguments, **options, key=jax.random.key(1))
+    np.testing.assert_allclose(many.values["height"], 0.2, atol=0.002)
+    np.testing.assert_allclose(many.values["reflectance"].ravel(), 0.35, atol=0.002)
+    plan = jl.plan(lidars[0], truth, window=(-40.0, 40.0), n_photons=1024)
+    with pytest.raises(ValueError, match="the plan does not fit"):
+        ask(inversion.retrieve_many, *arguments, **options, plan=plan, key=jax.random.key(1))
