@@ -212,6 +212,6 @@ def oblique_axes(
     for axis, side, largest in zip((ax.xaxis, ax.yaxis, ax.zaxis), sides, high):
         axis.set_major_locator(MaxNLocator(nbins=max(round(4 * side / max(sides)), 1)))
         # Labels of axes lie beyond those of ticks, of which map coordinates have six or seven digits.
-        axis.labelpad = 1.5 * len(f"{largest:.0f}")
+        axis.labelpad = 6.0 + 1.5 * len(f"{largest:.0f}")
     ax.ticklabel_format(style="plain", useOffset=False)
     return ax
