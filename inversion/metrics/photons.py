@@ -816,7 +816,7 @@ def _percentiles(
     count = np.bincount(number, minlength=n_segments)
     of_segments = np.split(z[np.argsort(number, kind="stable")], np.cumsum(count)[:-1])
     percentiles = [np.percentile(a, percentile) if a.size >= least else np.nan for a in of_segments]
-    return np.array(percentiles), count
+    return np.array(percentiles[:n_segments]), count
 
 
 def _canopy_percentile(

@@ -20,7 +20,7 @@ _SIMILARITY = 0.8
 _LEAST_LETTERS = 3
 
 
-class Column(NamedTuple):
+class NamedColumn(NamedTuple):
     """A column of a table: its index, its name as in the table, and the unit in that name or None."""
 
     index: int
@@ -49,7 +49,7 @@ def name_and_unit(name: str) -> tuple[str, str | None]:
 
 def match_columns(
     location: str, names: Sequence[str], known: Mapping[str, Sequence[str]]
-) -> dict[str, Column]:
+) -> dict[str, NamedColumn]:
     """Return the columns of a table by quantity.
 
     **Arguments:** `location`: the table, for messages. `names`: its columns. `known`: plain names of each
@@ -61,7 +61,9 @@ def match_columns(
     columns = {}
     for quantity, admissible in known.items():
         matches = [
-            Column(i, names[i].strip(), unit) for i, (name, unit) in enumerate(plain) if name in admissible
+            NamedColumn(i, names[i].strip(), unit)
+            for i, (name, unit) in enumerate(plain)
+            if name in admissible
         ]
         # A column again in another unit is not needed.
         without_unit = [column for column in matches if column.unit is None]
@@ -79,7 +81,7 @@ def match_columns(
 def check_columns(
     location: str,
     names: Sequence[str],
-    columns: Mapping[str, Column],
+    columns: Mapping[str, NamedColumn],
     known: Mapping[str, Sequence[str]],
     required: Iterable[str] = (),
 ) -> None:

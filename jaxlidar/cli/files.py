@@ -8,7 +8,7 @@ from typing import Any
 import click
 import numpy as np
 
-from jaxlidar._fields.columns import Column, match_columns
+from jaxlidar._fields.columns import NamedColumn, match_columns, name_and_unit
 from jaxlidar.cli.shared import ResultPath
 from jaxlidar.formats.airborne import AirborneShots
 from jaxlidar.formats.coordinates import GEOGRAPHIC
@@ -185,7 +185,7 @@ def describe_spectrum(path: Path) -> str:
     return f"spectrum {spectrum.name!r} of {spectrum.wavelength.size} samples from {low:g} to {high:g} nm"
 
 
-def describe_inventory(path: Path, columns: dict[str, Column], others: list[str]) -> str:
+def describe_inventory(path: Path, columns: dict[str, NamedColumn], others: list[str]) -> str:
     """Describe an inventory, with the names of its columns by quantity, and those that are not read."""
     trees = read_inventory(path)
     places = np.stack([trees.x, trees.y])
@@ -225,15 +225,15 @@ def describe_csv(path: Path) -> str:
     if TREE_COLUMN.search(head):
         return describe_tree(path)
     names = [name.strip() for name in re.split(r"[,;\t]", head)]
-    places = match_columns(f"{path}: line 1", names, PLACE_COLUMNS).keys()
+    places = _quantities(names, PLACE_COLUMNS)
     has_time = TIME_COLUMN.search(head) is not None
     has_places = places >= {"x", "y"} or places >= {"longitude", "latitude"}
     is_of_shots = has_places and not places.isdisjoint(("shot_number", "beam"))
-    if not has_time and not is_of_shots:
+    is_of_trees = _quantities(names, INVENTORY_COLUMNS) >= {"x", "y", "height"}
+    if is_of_trees and not has_time and not is_of_shots:
         columns = match_columns(f"{path}: line 1", names, INVENTORY_COLUMNS)
-        if columns.keys() >= {"x", "y", "height"}:
-            read = [column.name for column in columns.values()]
-            return describe_inventory(path, columns, [name for name in names if name not in read])
+        read = [column.name for column in columns.values()]
+        return describe_inventory(path, columns, [name for name in names if name not in read])
     if is_of_shots or (has_places and not has_time):
         return describe_places(path, places)
     if not TRAJECTORY_COLUMN.search(head):
@@ -244,6 +244,12 @@ def describe_csv(path: Path) -> str:
             "the crs= of a map"
         )
     return str(read_trajectory(path))
+
+
+def _quantities(names: list[str], known: Mapping[str, Sequence[str]]) -> set[str]:
+    """Return the quantities that columns may be; several columns may be one of them."""
+    plain = {name_and_unit(name)[0] for name in names}
+    return {quantity for quantity, admissible in known.items() if not plain.isdisjoint(admissible)}
 
 
 def _spans(low: np.ndarray, high: np.ndarray) -> str:

@@ -94,16 +94,16 @@ def max_unpacked_size(path: Path) -> int:
 
 
 def check_step_of_light(location: str, length: float, expected: float = TWO_WAY_METRES_PER_NS) -> None:
-    """Refuse a length in m of 1 ns of a record that is not what light goes there and back.
+    """Refuse a length in m of 1 ns of a record that is not half of what light travels.
 
-    **Arguments:** `expected`: what light goes, m; less in elevation than along an inclined beam.
+    **Arguments:** `expected`: what it is, m. In elevation it is less than along an inclined beam.
 
     **Raises:** ValueError naming the location and both lengths.
     """
     if not abs(length - expected) <= TWO_WAY_TOLERANCE * expected:
         raise ValueError(
-            f"{location}: {length:g} m from sample to sample, where light goes {expected:.4f} m there and "
-            "back in 1 ns"
+            f"{location}: {length:g} m from sample to sample, where 1 ns of light, there and back, comes to "
+            f"{expected:.4f} m"
         )
 
 

@@ -155,10 +155,10 @@ class ProductFile:
             chunk = node.chunks or stored
             chunks = math.prod(math.ceil(size / part) if part else 0 for size, part in zip(stored, chunk))
             contiguous = node.id.get_storage_size() // max(node.nbytes, 1)
-            held = node.id.get_num_chunks() if node.chunks else contiguous
-        if is_elsewhere or held < chunks:
+            n_stored = node.id.get_num_chunks() if node.chunks else contiguous
+        if is_elsewhere or n_stored < chunks:
             raise ValueError(
-                f"{location}: {math.prod(stored)} numbers are declared, but the file holds {held} of "
+                f"{location}: {math.prod(stored)} numbers are declared, but the file holds {n_stored} of "
                 f"{chunks} parts of them"
             )
         if shape not in (None, stored):

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxlidar._fields.checks import check_number, warn_user
-from jaxlidar._fields.columns import Column, name_and_unit
+from jaxlidar._fields.columns import NamedColumn, name_and_unit
 from jaxlidar.formats.checks import MAX_COORDINATE, FileWarning, column_index
 from jaxlidar.formats.text import parse_integer, parse_number, read_table
 from jaxlidar.plants.tree import Tree
@@ -160,7 +160,7 @@ class _Cylinder(NamedTuple):
     radius: float
 
 
-def _columns(path: Path, names: list[str]) -> dict[str, Column]:
+def _columns(path: Path, names: list[str]) -> dict[str, NamedColumn]:
     """Return each column in use: that of its first name which the table has. Orders may be missing."""
     plain, units = zip(*map(name_and_unit, names))
     # A column again in another unit is not needed.
@@ -171,12 +171,12 @@ def _columns(path: Path, names: list[str]) -> dict[str, Column]:
         present = [name for name in known if name in plain]
         if present or column != "order":
             i = column_index(f"{path}: line 1", plain, (present or known)[0])
-            columns[column] = Column(i, names[i], units[i])
+            columns[column] = NamedColumn(i, names[i], units[i])
     return columns
 
 
 def _cylinder(
-    path: Path, line: int, column: dict[str, Column], cells: list[str], units: dict[str, float]
+    path: Path, line: int, column: dict[str, NamedColumn], cells: list[str], units: dict[str, float]
 ) -> _Cylinder:
     location = f"{path}: line {line}"
     integers = {k: parse_integer(path, line, k, cells[column[k].index]) for k in _INTEGERS if k in column}

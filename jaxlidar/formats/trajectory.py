@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxlidar._fields.checks import UnitWarning
-from jaxlidar._fields.columns import Column, check_columns, match_columns, plain_name
+from jaxlidar._fields.columns import NamedColumn, check_columns, match_columns, plain_name
 from jaxlidar._fields.crs import (
     common_system,
     directions_of_north,
@@ -158,7 +158,7 @@ def read_trajectory(path: str | os.PathLike[str], *, crs: str | None = None) -> 
         raise ValueError(f"{path}: line {numbers[0]} and following: {error}") from error
 
 
-def _header(path: Path, lines: list[str]) -> tuple[int, str, dict[str, Column]]:
+def _header(path: Path, lines: list[str]) -> tuple[int, str, dict[str, NamedColumn]]:
     """Return the index of the line that names the columns, the delimiter, and the columns in use."""
     data = [i for i, line in enumerate(lines) if line.strip() and not line.lstrip().startswith("#")]
     if not data:
@@ -230,7 +230,7 @@ def _cells(path: Path, line: int, text: str, delimiter: str) -> list[str]:
     return split_cells(path, line, re.sub(r"\s+(?=[\[(])", "", text) if delimiter == " " else text, delimiter)
 
 
-def _value(path: Path, line: int, column: Column, cells: list[str]) -> float:
+def _value(path: Path, line: int, column: NamedColumn, cells: list[str]) -> float:
     value = parse_number(path, line, column.name, cells[column.index])
     if not np.isfinite(value):
         raise ValueError(f"{path}: line {line}: {column.name} is not finite")

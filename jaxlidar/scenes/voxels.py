@@ -131,7 +131,7 @@ class VoxelMap(eqx.Module):
 
     @property
     def counts(self) -> Int[Array | np.ndarray, "3"]:
-        """(3,) numbers of voxels along x, y and z."""
+        """(3,) numbers of voxels along x, y and z: `shape` as an array, which programs trace."""
         return np.array(self.shape) if self._counts is None else self._counts
 
     @property
